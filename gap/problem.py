@@ -14,7 +14,7 @@ import numpy as np
 from makebreak.gap.data.recording import Recording
 from makebreak.gap.numerics.selection import LinearFit
 from makebreak.gap.result import GapMeasure, Series, Unexplained, Where
-from makebreak.gap.thresholds import NESTED_GAIN
+from makebreak.gap.thresholds import NESTED_GAIN, UNEXPLAINED_RMS, UNEXPLAINED_SHARE
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, check_parameters
@@ -150,6 +150,12 @@ def share_left(before: float, after: float) -> float:
     return max(after - 1.0, 0.0) / max(before - 1.0, 1e-9)
 
 
+def leaves_gap(start: float, end: float) -> bool:
+    """Whether effects that take an error from start to end leave more than laws that
+    are approximations do. Errors are in units of the noise."""
+    return end > max(UNEXPLAINED_RMS, UNEXPLAINED_SHARE * start)
+
+
 @dataclass(frozen=True, eq=False)
 class Fitted:
     """Effects with their best parameters. std: of each effect's parameters. r (m,):
@@ -175,11 +181,13 @@ class Fitted:
 @dataclass(frozen=True, eq=False)
 class Outcome:
     """What the decided effects are worth on some data, by simulation where there is
-    one, and what is left."""
+    one, and what is left. expects: what counts as noise in it beside that of sensors,
+    as sentences; "": nothing."""
 
     gap: GapMeasure
     series: Sequence[Series] = ()
     unexplained: Sequence[Unexplained] = ()
+    expects: str = ""
 
 
 @dataclass(frozen=True, eq=False)

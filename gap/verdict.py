@@ -7,7 +7,7 @@ from math import isnan
 from pydrake.multibody.plant import MultibodyPlant
 
 from makebreak.gap.data.recording import unit_of
-from makebreak.gap.problem import share_left
+from makebreak.gap.problem import leaves_gap, share_left
 from makebreak.gap.result import Estimate, Evidence, GapMeasure, NamedEffect
 from makebreak.gap.search.choice import Choice, Selection, called
 from makebreak.gap.thresholds import (
@@ -15,7 +15,6 @@ from makebreak.gap.thresholds import (
     CLOSED_SHARE_MIN,
     NOISE_RMS_MAX,
     UNEXPLAINED_RMS,
-    UNEXPLAINED_SHARE,
 )
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import (
@@ -41,7 +40,7 @@ def verdict_of(
     if not choices:
         calm = start <= max(AGREEMENT_RMS_MAX, NOISE_RMS_MAX) and not far
         return "no_gap" if calm else "gap_unnamed"
-    if far or end > max(UNEXPLAINED_RMS, UNEXPLAINED_SHARE * start):
+    if far or leaves_gap(start, end):
         return "gap_unnamed"
     return "ambiguous" if any(c.ties for c in choices) else "gap_named"
 

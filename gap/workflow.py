@@ -347,6 +347,8 @@ def conclude(
     near += drifting if selection.choices else ""
     if verdict == "gap_unnamed":
         near += problem.hint(selection.end)
+    else:
+        near += final.expects
     before = [
         Choice(f.effect, f.std, f.before, f.after, "", 0.0, (), (), 1)
         for f in problem.found_before()

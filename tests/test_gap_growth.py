@@ -19,7 +19,7 @@ def test_a_start_and_noise_spread_as_the_closed_form_says():
     white, steady = 2e-6, 1e-4
     found = spread_along(
         np.array([[[w**2, 0.0]]] * 3), np.array([[[W]]] * 3),
-        start, np.array([white]), np.array([steady]), t,
+        start, np.array([white]), np.array([steady]), t, np.zeros((len(t), 1)),
     )  # fmt: skip
     c, s = np.cosh(w * t), np.sinh(w * t)
     moved = np.stack([[c, s / w], [w * s, c]]).transpose(2, 0, 1)
@@ -31,6 +31,23 @@ def test_a_start_and_noise_spread_as_the_closed_form_says():
     # Between its 12 steps the deviation is a line.
     np.testing.assert_allclose(np.sqrt(found), np.sqrt(expected), rtol=0.07)
     np.testing.assert_allclose(found[[0, -1]], expected[[0, -1]], rtol=2e-3)
+
+
+def test_an_impulse_moves_a_free_joint_from_then_on():
+    mobility, size, at = 2.0, 0.3, 0.1
+    t = np.linspace(0.0, 0.3, 61)
+    impulses = np.where(np.isclose(t, at), size**2, 0.0)[:, None]
+    free, still = np.zeros((3, 1, 2)), np.zeros((2, 2))
+    found = spread_along(
+        free, np.full((3, 1, 1), mobility), still, np.zeros(1), np.zeros(1), t, impulses
+    )  # fmt: skip
+    place, rate = np.sqrt(found.T)
+    later = t > at + 0.03  # It is known to within a step of 0.025 s.
+    np.testing.assert_allclose(rate[later], mobility * size, rtol=1e-6)
+    np.testing.assert_allclose(
+        place[later], mobility * size * (t[later] - at), atol=mobility * size * 0.025
+    )
+    assert not found[t < at - 0.03].any()
 
 
 def test_slopes_are_those_of_a_pendulum(tmp_path):

@@ -5,10 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
 
 pytest.importorskip("mujoco", reason="the logs are simulated in MuJoCo")
 
 from gap_benchmark.log_cases import LogCase, Recipe, write  # noqa: E402
+from gap_benchmark.robot_log import wandering  # noqa: E402
 
 from makebreak.gap.data.reading import read_recording  # noqa: E402
 from makebreak.gap.residuals.inverse import InverseModel  # noqa: E402
@@ -39,6 +41,32 @@ def test_what_sensors_and_drives_do_is_no_gap(tmp_path, robot, option):
     recipe = Recipe("none", robot, "multisine guided", options=(option,))
     _, result = found_in(tmp_path, recipe, 77)
     assert (result.verdict, result.effects) == ("no_gap", [])
+    assert ("is taken for noise of the sensors" in result.says) == (option == "wander")
+
+
+def test_slow_noise_of_one_effort_does_not_hide_what_is_missing_at_another(tmp_path):
+    """As in a log of a real double pendulum: the equation of the shoulder is not met,
+    by more than its sensor could make; windows that expect what is left of the elbow's
+    effort as its noise agree all the same, because joints move each other."""
+    recipe = Recipe("friction", "planar", "multisine", "friction", ("ode",))
+    write(LogCase("log", 78, recipe), tmp_path)
+    log = tmp_path / "recording.csv"
+    with log.open() as file:
+        names = file.readline().strip().split(",")
+        table = np.loadtxt(file, delimiter=",")
+    rng, step = np.random.default_rng(1), np.median(np.diff(table[:, 0]))
+    stirred = gaussian_filter1d(rng.normal(size=len(table)), 0.1 / step)
+    added = {
+        "shoulder": 0.2 * stirred / np.std(stirred),  # [N m]
+        "elbow": 0.1 * wandering(len(table), step, 0.5, (1,), rng)[:, 0],
+    }
+    for joint, effort in added.items():
+        table[:, names.index(f"planar.{joint}.effort_measured")] += effort
+    np.savetxt(log, table, "%.9g", ",", header=",".join(names), comments="")
+    result = run_gap(tmp_path / "scene.yaml", [log])
+    assert result.verdict == "gap_unnamed"
+    assert result.gap.after > 3.0
+    assert "is taken for noise" not in result.says
 
 
 def test_weights_of_two_links_add_up_and_those_of_one_do_not(tmp_path):

@@ -13,6 +13,7 @@ def spread_along(
     white: np.ndarray,
     steady: np.ndarray,
     after: np.ndarray,
+    impulses: np.ndarray,
 ) -> np.ndarray:
     """Variances (m, 2 n) of positions and velocities at the times `after` (m,) [s].
 
@@ -21,7 +22,8 @@ def spread_along(
     Args: slopes: (k, n, 2 n) da/d(q, v) in each of k parts of equal length.
         mobility: (k, n, n) W = M^-1. start: (2 n, 2 n) covariance at 0.
         white: (n,) density of the efforts' white noise [(N m)^2 s]. steady: (n,)
-        variance of what is the same all the time [(N m)^2].
+        variance of what is the same all the time [(N m)^2]. impulses: (m, n) variance
+        of the impulse that an effort has too much at each time [(N m s)^2].
     """
     n = len(white)
     end = float(after[-1])
@@ -29,6 +31,9 @@ def spread_along(
         return np.tile(np.diag(start), (len(after), 1))
     each = 4  # Steps of a part.
     h = end / (each * len(slopes))
+    density = np.tile(white, (each * len(slopes), 1))  # Of each step.
+    steps = np.minimum((after / h).astype(int), len(density) - 1)
+    np.add.at(density, steps, impulses / h)
     P = np.array(start, float)
     S = np.zeros((2 * n, n))  # What a steady effort does.
     found = [np.diag(P).copy()]
@@ -42,9 +47,10 @@ def spread_along(
         step = half @ half
         inputs = np.stack([B, half @ B, step @ B])
         weights = np.array([1.0, 4.0, 1.0]) / 6.0 * h
-        noise = np.einsum("s,sij,j,skj->ik", weights, inputs, white, inputs)
+        made = np.einsum("s,sij,skj->jik", weights, inputs, inputs)
         pushed = np.einsum("s,sij->ij", weights, inputs)
         for _ in range(each):
+            noise = np.tensordot(density[len(found) - 1], made, 1)
             P = step @ P @ step.T + noise
             S = step @ S + pushed
             found.append(np.diag(P) + (S**2) @ steady)

@@ -10,11 +10,15 @@ from functools import cache
 from math import comb
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 _ORDERS = (2, 3, 4, 5, 6)
 _MOST = 200_000  # Samples that are looked at: 0.3 % precision is plenty.
 _LAGS = 40  # Over which noise may go together.
 _NORMAL = 1.4826  # Standard deviation over median absolute deviation, if normal.
+# Standard deviations of a second difference from which it is a jump, beside the median
+# of so many.
+_JUMP_Z, _JUMP_ROWS = 5.0, 7
 
 
 @dataclass(frozen=True)
@@ -93,6 +97,28 @@ def noise_and_jitter(values, breaks, times, noise: float) -> tuple[float, float]
     return min(
         (_jitter_of(pieces, order, noise) for order in (3, 5)), key=lambda x: x[1]
     )
+
+
+def jump_variance(values, noise: float) -> np.ndarray:
+    """(n,) variance of a signal's integral that its jumps make, by row [(unit row)^2]:
+    at what time between two samples they were is not known.
+
+    A jump J, taken to be in the middle of a period T, is off by J T/sqrt(12). Second
+    differences show it, twice, and nothing of what is smooth.
+
+    Args: values (n,): NaN where there is no sample. noise: of a sample.
+    """
+    y = np.asarray(values, dtype=float)
+    found = np.zeros(len(y))
+    good = np.flatnonzero(np.isfinite(y))
+    if len(good) >= 3:
+        second = np.diff(y[good], 2)
+        second -= median_filter(second, _JUMP_ROWS)
+        is_jump = np.abs(second) > _JUMP_Z * noise * np.sqrt(6.0)
+        # A table may have more rows than this signal has samples.
+        periods = np.gradient(good.astype(float))[1:-1]
+        found[good[1:-1]] = np.where(is_jump, (periods * second) ** 2 / 24.0, 0.0)
+    return found
 
 
 def noise_beside(parts) -> tuple[float, float]:

@@ -17,6 +17,7 @@ from makebreak.gap.problem import (
     Nuisances,
     Outcome,
     SearchPlan,
+    leaves_gap,
     rms,
     share_left,
 )
@@ -33,7 +34,7 @@ from makebreak.gap.residuals.mechanism_candidates import (
 from makebreak.gap.residuals.mechanism_measure import measure
 from makebreak.gap.residuals.pushes import ROBUST, Push, find_pushes
 from makebreak.gap.residuals.where import unexplained, where_in_motion
-from makebreak.gap.result import Where
+from makebreak.gap.result import GapMeasure, Series, Where
 from makebreak.gap.simulation.windows import Window
 from makebreak.gap.thresholds import (
     BESIDE_NOISE_EVIDENCE,
@@ -488,6 +489,40 @@ class MechanismProblem(InverseModel, GapProblem):
                 found[k] = rms(y)
         return found
 
+    def _expected_noise(self, start: Fitted, end: Fitted) -> dict[str, float]:
+        """{joint: slow noise of its effort [N m]} that simulated windows expect. None
+        where the equations leave a gap beside it: joints move each other, so what is
+        missing at one shows at others, and windows that have it for noise would agree
+        with any model."""
+        if leaves_gap(self.error(start), self.error(end)):
+            return {}
+        found = self.slow_noise(end.r)
+        return {j: float(found[k]) for k, (_, j) in enumerate(self.names()) if found[k]}
+
+    def _says_expected(self, found: dict[str, float]) -> str:
+        """The slow noise {joint: [N m]} that windows expect, as a sentence."""
+        if not found:
+            return ""
+        times = {
+            joint: size / self._sample_noise(f"{joint}.effort_measured")
+            for joint, size in found.items()
+        }
+        joint = max(times, key=lambda each: times[each])
+        unit = "N" if joint in sliding_joints(self.dynamics.plant) else "N m"
+        size = f"{found[joint]:.2g} {unit}"
+        ratio = f"{times[joint]:.2g} times a sample's noise"
+        what = f"the measured effort of {joint}, {size} ({ratio}),"
+        if len(found) > 1:
+            what = (
+                f"the measured efforts of {len(found)} joints, up to {ratio} ({size} "
+                f"at {joint}),"
+            )
+        return (
+            f" What is left of {what} is correlated in time and nothing in the motion "
+            "predicts it: it is taken for noise of the sensors. A force that is not in "
+            "the catalogue would look the same."
+        )
+
     def _sample_noise(self, channel: str) -> float:
         """Of one sample, before means over many were taken."""
         every = [r.channels[channel] for r in self.recordings]
@@ -613,16 +648,52 @@ class MechanismProblem(InverseModel, GapProblem):
         else:
             model = self
         moved = moved_links(self, nuisances, end.b)
-        found = self.slow_noise(end.r)
-        measured = measure(
-            scene, effects, moved, model, model is not self, jobs,
-            self._is_pushed if model is self else lambda window: False,
-            {joint: found[k] for k, (_, joint) in enumerate(self.names()) if found[k]},
-        )  # fmt: skip
+        slow = self._expected_noise(start, end)
+        expects = self._says_expected(slow)
+
+        def measured_with(
+            noise: dict[str, float],
+        ) -> tuple[GapMeasure, list[Series]] | None:
+            return measure(
+                scene, effects, moved, model, model is not self, jobs,
+                self._is_pushed if model is self else lambda window: False, noise,
+            )  # fmt: skip
+
+        measured = measured_with(slow)
         if measured is None:  # In every window something pushes.
             return None
+        agree = not leaves_gap(self.error(start), self.error(end))
+        if agree and not effects and measured[0].before > UNEXPLAINED_RMS:
+            # Where equations are sure of nothing, links are not known better than
+            # that, and windows of encoders that are good show it.
+            unknown = self._effort_of_nuisances(nuisances)
+            more = measured_with(
+                {j: float(np.hypot(x, slow.get(j, 0.0))) for j, x in unknown.items()}
+            )
+            if more is not None and more[0].before <= UNEXPLAINED_RMS:
+                expects += (
+                    " Simulated windows differ by "
+                    f"{measured[0].before:.2g} times the noise of the sensors, but by "
+                    "no more than masses and centres of mass of the links, known to "
+                    "within their tolerance, leave unknown."
+                )
+                measured = more
         rest = unexplained(self, self.in_noise(end.left))
-        return Outcome(*measured, rest)
+        return Outcome(*measured, rest, expects)
+
+    def _effort_of_nuisances(self, nuisances: Nuisances) -> dict[str, float]:
+        """{joint: standard deviation of its effort [N m]} that is not known of the
+        nuisances, after what the fitted rows say of them."""
+        N = nuisances.columns[self.train()]
+        known = N.T @ N + np.diag(1.0 / nuisances.prior**2)
+        root = np.linalg.cholesky(np.linalg.inv(known))
+        each = [self.in_units(column) for column in (nuisances.columns @ root).T]
+        std = np.sqrt(np.sum(np.square(each), axis=0))
+        return {
+            joint: rms(std[:, k])
+            for k, (what, joint) in enumerate(self.names())
+            if what == "effort"
+        }
 
 
 def beyond_noise(off: np.ndarray, noise: np.ndarray) -> float:

@@ -8,9 +8,9 @@ mass matrix into all joints' equations.
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from scipy.ndimage import median_filter
 
 from makebreak.gap.data.recording import Recording
+from makebreak.gap.numerics.signal_noise import jump_variance
 from makebreak.gap.residuals.mechanism_motion import MechanismMotion
 from makebreak.gap.residuals.track import Track
 from makebreak.models.dynamics import SceneDynamics
@@ -26,9 +26,6 @@ REST_SPEED, REST_SHARE, REST_EFFORT = 0.005, 0.04, 0.3
 DRIVE_VELOCITY = 0.01
 MODEL_ERROR = 2e-4  # Of a joint's rms effort: what smoothing and sampling leave.
 LEAST_EFFORT = 0.1  # Of a joint, as a share of the largest joint's: rms.
-# Standard deviations of a second difference from which it is a jump, beside the median
-# of so many.
-JUMP_Z, JUMP_ROWS = 5.0, 7
 LEAST_STD = 1e-12  # Of a channel that has no noise.
 
 
@@ -105,27 +102,13 @@ class WhitenedRows(MechanismMotion):
 
     def _unknown_jumps(self, track: Track) -> np.ndarray:
         """(n_bumps, n_v) standard deviations of means of measured efforts that jump
-        between two samples: at what time, within one period, is not known.
-
-        A jump J, taken to be in the middle of a period T, is off by J T/sqrt(12).
-        Second differences show it, twice, and nothing of what is smooth.
-        """
+        between two samples."""
         out = np.zeros((len(track.bumps.centre), len(self.joints)))
         for i, joint in enumerate(self.joints):
-            if not self.by_measured[i]:
-                continue
-            y = track.samples[f"{joint}.effort_measured"]
-            good = np.flatnonzero(np.isfinite(y))
-            if len(good) < 3:
-                continue
-            second = np.diff(y[good], 2)
-            second -= median_filter(second, JUMP_ROWS)
-            noise = self.effort_noise[i] * np.sqrt(6.0)
-            second = np.where(np.abs(second) > JUMP_Z * noise, second, 0.0)
-            # A table may have more rows than this channel has samples.
-            rows = (np.gradient(good.astype(float))[1:-1] * second) ** 2 / 24.0
-            weights = track.row_bumps.w[:, good[1:-1]]
-            out[:, i] = np.sqrt(weights.power(2) @ rows)
+            if self.by_measured[i]:
+                y = track.samples[f"{joint}.effort_measured"]
+                variance = jump_variance(y, self.effort_noise[i])
+                out[:, i] = np.sqrt(track.row_bumps.w.power(2) @ variance)
         return out
 
     def _gains(self, track: Track, what: str, otherwise: float) -> np.ndarray:

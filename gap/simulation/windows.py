@@ -14,6 +14,7 @@ import numpy as np
 from makebreak.gap.data.recording import Episode, Recording
 from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.numerics.growth import spread_along
+from makebreak.gap.numerics.signal_noise import jump_variance
 from makebreak.gap.numerics.struck import struck_rows
 from makebreak.gap.simulation.channel_effects import (
     given_late,
@@ -249,6 +250,7 @@ class WindowModel(WindowedResidual):
             for k in at:
                 rough[max(k - BESIDE, 0) : k + BESIDE + 1] = True
         commands = [recording.held(c.name)[episode.rows] for c in recording.commands()]
+        jumps = self._unknown_jumps(recording, episode)
         # At an end a smoothed state is less sure than it knows, and what was commanded
         # before is not known.
         margin = min(MARGIN_SEC, 0.1 * (time[-1] - time[0]))
@@ -267,7 +269,7 @@ class WindowModel(WindowedResidual):
                 std = np.empty((last - start_row, len(self.channels)))
                 state = {n: x[start_row] for n, x in states.items()}
                 grown = self._grown(
-                    recording, states, spreads, slice(start_row, last), after
+                    recording, states, spreads, slice(start_row, last), after, jumps
                 )
                 for c, name in enumerate(self.channels):
                     if name in grown:
@@ -362,7 +364,7 @@ class WindowModel(WindowedResidual):
         return time, columns
 
     def _grown(
-        self, recording: Recording, states, spreads, rows: slice, after
+        self, recording: Recording, states, spreads, rows: slice, after, jumps
     ) -> dict[str, np.ndarray]:
         """{channel of a joint: (m,) variance} that the uncertain start of a window, and
         noise of measured efforts that stand in for commands, have made of it: along
@@ -391,8 +393,11 @@ class WindowModel(WindowedResidual):
             q[:, i], v[:, i], vd[:, i] = states[key][at].T
             start[np.ix_([i, n + i], [i, n + i])] = spreads[key][rows.start, :2, :2]
         white, steady = self._effort_noise(recording, joints, n)
+        impulses = np.zeros((len(after), n))
+        for name, variance in jumps.items():
+            impulses[:, joints[name]] = variance[rows]
         slopes, mobility = self.dynamics.slopes(q, v, vd)
-        made = spread_along(slopes, mobility, start, white, steady, after)
+        made = spread_along(slopes, mobility, start, white, steady, after, impulses)
         return {
             f"{name}.{what}": made[:, i + k * n]
             for name, i in joints.items()
@@ -404,14 +409,30 @@ class WindowModel(WindowedResidual):
         of what is white [(N m)^2 s], and (n,) the variance of what is the same
         throughout a window [(N m)^2]."""
         white, steady = np.zeros(n), np.zeros(n)
-        if not self._commanded(recording):
-            for name in self._driven("effort_command"):
-                if (key := f"{name}.effort_measured") in recording:
-                    channel = recording.channels[key]
-                    i = joints[name]
-                    white[i] = channel.noise**2 / max(channel.rate_hz, 1e-6)
-                    steady[i] = self._slow_noise.get(name, 0.0) ** 2
+        for name in self._by_measured(recording):
+            channel = recording.channels[f"{name}.effort_measured"]
+            i = joints[name]
+            white[i] = channel.noise**2 / max(channel.rate_hz, 1e-6)
+            steady[i] = self._slow_noise.get(name, 0.0) ** 2
         return white, steady
+
+    def _unknown_jumps(self, recording: Recording, episode: Episode):
+        """{joint: (n,) variance of its impulse, by row [(N m s)^2]} that jumps of an
+        effort leave unknown, which is drawn as a line between its samples."""
+        found = {}
+        period = np.gradient(recording.time[episode.rows])
+        for joint in self._by_measured(recording):
+            channel = recording.channels[f"{joint}.effort_measured"]
+            y = recording[channel.name][episode.rows]
+            found[joint] = jump_variance(y, channel.noise) * period**2
+        return found
+
+    def _by_measured(self, recording: Recording) -> list[str]:
+        """Joints of which a measured effort stands in for the command."""
+        if self._commanded(recording):
+            return []
+        driven = self._driven("effort_command")
+        return [joint for joint in driven if f"{joint}.effort_measured" in recording]
 
     def _commanded(self, recording: Recording) -> list[str]:
         """Names of the commands that the scene's drives take."""
