@@ -122,9 +122,9 @@ def test_a_clock_is_off_from_the_first_row_on_and_not_since_1970(scene, tmp_path
     np.testing.assert_allclose(rows[0], rows[1], atol=0.05 * np.abs(rows[0]).max())
 
 
-def log_of_a_fast_loop(folder):
+def log_of_a_fast_loop(folder, **other):
     """Samples of commands that change all the time, 67 rows a second."""
-    path = log(folder, "a", 13, effort_noise=0.0)
+    path = log(folder, "a", 13, effort_noise=0.0, **other)
     header, *lines = path.read_text().splitlines()
     header = header.replace("effort_measured", "effort_command")
     path.write_text("\n".join([header, *lines[::3]]))
@@ -135,6 +135,14 @@ def test_commands_of_a_faster_loop_are_no_gap(scene, tmp_path):
     result = run_gap(scene, [log_of_a_fast_loop(tmp_path)])
     assert (result.verdict, result.effects) == ("no_gap", [])
     assert "sampled_commands" in {c.kind for c in result.checks}
+
+
+def test_a_command_holds_until_its_loop_gives_the_next(scene, tmp_path):
+    """At a kilohertz it acts half a millisecond later than at its row, which was named
+    as a delay of the sensors."""
+    path = log_of_a_fast_loop(tmp_path, effort_late=-5e-4, position_noise=5e-6)
+    result = run_gap(scene, [path])
+    assert (result.verdict, result.effects) == ("no_gap", [])
 
 
 def test_commands_of_a_faster_loop_are_found_among_means_over_many_rows(

@@ -39,6 +39,7 @@ class Channel:
     step: the channel's resolution if it is quantised, else 0.
     rate_hz: samples that are there per second. filter: what the sidecar says.
     stages: what of that is simulated; None if the text says no filter we know.
+    sampled: it is what a faster loop commanded at each row.
     """
 
     name: str
@@ -53,6 +54,7 @@ class Channel:
     rate_hz: float = 0.0
     filter: str = ""
     stages: tuple[Stage, ...] | None = ()
+    sampled: bool = False
 
     @property
     def model(self) -> str:

@@ -21,7 +21,9 @@ def as_samples(recordings: Sequence[Recording]) -> list[Recording]:
                 name = f"{channel.at}.effort_measured"
                 if name in recording:
                     continue
-                channel = replace(channel, name=name, noise_from="estimated")
+                channel = replace(
+                    channel, name=name, noise_from="estimated", sampled=True
+                )
             channels[name] = channel
         out.append(replace(recording, channels=channels))
     return out

@@ -289,9 +289,26 @@ class InverseModel(WhitenedRows):
 
     def loop_timing(self) -> tuple[list[np.ndarray], list[float], list[str]]:
         """Columns (m,) of the residual, standard deviations [s] and names of what is
-        not known of drives' own loops: by how much the velocity that they feed back is
-        late. (A late position is damping, which is looked for.)"""
+        not known of fast loops: by how much the velocity that a drive feeds back is
+        late (a late position is damping, which is looked for), and efforts that were
+        commanded at a row, and hold until the loop gives the next."""
         columns, names = [], []
+        efforts = []
+        sampled = [
+            i
+            for i, joint in enumerate(self.joints)
+            if self.by_measured[i]
+            and any(r.channels[f"{joint}.effort_measured"].sampled
+                    for r in self.recordings)
+        ]  # fmt: skip
+        if sampled:
+            for motion in self.motions():
+                late = np.zeros((*motion.v.shape, 1))
+                given = motion.effort[:, sampled]
+                late[:, sampled, 0] = -np.gradient(given, motion.time, axis=0)
+                efforts.append(late)
+            columns.append(self.columns_of(efforts)[:, 0])
+            names.append("input_delay of all joints, loop")
         for i, law in enumerate(self.laws):
             if law is None or not self.commanded[i] or not law.kd > 0.0:
                 continue
