@@ -449,6 +449,19 @@ def test_push_is_over_when_the_ball_has_rolled_away_sideways(side):
         assert state.phase == phase
 
 
+def test_a_tip_behind_the_ball_goes_on_pushing_as_far_as_it_can_touch_it():
+    ball = np.array([0.6, 0.0, R_BALL])
+    reach = R_BALL + R_TIP
+    for behind, phase in ((0.03, ROLL), (reach - 1e-3, ROLL), (0.06, REPOSITION)):
+        tip = np.append(ball[:2] - behind * PATH.heading(ball), R_BALL + 0.03)
+        x = pack(tip, np.zeros(3), ball, np.zeros(3), R_BALL)
+        state = TaskState(ROLL, 0.0, tip, np.zeros(3), np.zeros(3))
+        state = next_state(
+            RollingConfig(), PATH, state, 0.1, DT, x, 0.0, True, R_BALL, R_TIP
+        )  # fmt: skip
+        assert state.phase == phase
+
+
 def approach(surface, gap_std, T=3.0, v_ball=lambda t: np.zeros(2)):
     """A task that lands on a surface at a height [m] over the modelled landing point,
     felt as 8 N once the reference is 0.2 mm inside it; 3 N are felt in the air."""

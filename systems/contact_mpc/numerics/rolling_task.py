@@ -133,7 +133,8 @@ class RollingConfig:
     roll_sec: float = 1.0  # Longest time of a push [s].
     # Longest time of a push in which the tip has to feel for the ball [s].
     roll_feel_sec: float = 1.5
-    # Horizontal distance of the tip from the ball's centre at which a push ends [m].
+    # Horizontal distance of the tip from the ball's centre, ahead of it or beside it,
+    # at which a push ends [m].
     roll_ahead: float = 0.025
     # Time of a reposition, from lifting the tip to the landing [s].
     reposition_sec: float = 0.55
@@ -328,6 +329,18 @@ def _target(center, radius, x, lead, speed, z_tip, radius_ball, dt, n_knots):
     return goal
 
 
+def _pushes(config, path, x, reach) -> bool:
+    """Whether the tip is where it can push the ball on: not in front of it, or beside a
+    ball that has rolled away from under it. Behind it, it may be as far as it can touch
+    it, a distance of `reach` [m]: over the ball and back takes longer than to follow.
+    """
+    off = (x[P_TIP] - x[P_BALL])[:2]
+    heading = path.heading(x[P_BALL])
+    behind = min(off @ heading, 0.0) * heading
+    beside = off - behind
+    return bool(beside @ beside < config.roll_ahead**2 and off @ off < reach**2)
+
+
 def next_state(
     config, path, state, t, dt, x, gap, valid, radius_ball, radius_tip, landed=None,
     gap_std=0.0, force_z=0.0, withdrawn=None, hidden=True,
@@ -393,11 +406,9 @@ def next_state(
     if state.phase == WAIT:
         state = lift_from(REPOSITION)
     if state.phase == ROLL:
-        ball = x[P_BALL]
-        off = (x[P_TIP] - ball)[:2]
-        # In front of it, or beside a ball that has rolled away from under it.
         longest = config.roll_feel_sec if state.feel else config.roll_sec
-        if t - state.since_sec < longest and off @ off < config.roll_ahead**2:
+        near = _pushes(config, path, x, radius_ball + radius_tip)
+        if t - state.since_sec < longest and near:
             return state
         state = lift_from(REPOSITION)
     strays = state.strayed > config.coast_change
