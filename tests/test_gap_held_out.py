@@ -7,6 +7,7 @@ from test_gap_contact import ball_scene, rolled, touched
 
 from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.data.split import split
+from makebreak.gap.data.table import write_recording
 from makebreak.gap.workflow import run_gap
 
 
@@ -55,6 +56,27 @@ def spoil_what_is_reported(file, spoil) -> int:
         spoilt += 1
     file.write_text("\n".join([head, *lines]) + "\n")
     return spoilt
+
+
+@pytest.mark.parametrize(
+    ("trials", "whole"), [(1, 0), (3, 0), (4, 1), (5, 1), (8, 2), (10, 2)]
+)
+def test_of_four_trials_the_last_is_held_out_and_not_the_end_of_each(
+    tmp_path, trials, whole
+):
+    """A wall that each trial meets last would never be fitted."""
+    rows = np.arange(1000.0)
+    columns = {
+        "time": np.tile(rows / 100.0, trials),
+        "episode": np.repeat(range(trials), 1000),
+        "p.j.position": np.zeros(1000 * trials),
+    }  # fmt: skip
+    write_recording(tmp_path / "run.csv", columns)
+    parts = split(read_recordings([tmp_path / "run.csv"]))
+    [first], [last] = parts.decided, parts.reported
+    lengths = [len(first.time[e.rows]) for e in first.episodes]
+    assert lengths == [1000] * (trials - whole) if whole else [800] * trials
+    assert len(last.time) == 1000 * trials - sum(lengths)
 
 
 @pytest.mark.parametrize(
