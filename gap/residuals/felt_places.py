@@ -26,9 +26,7 @@ from makebreak.gap.residuals.touching import MEETS
 from makebreak.gap.simulation.contact_shapes import Slot
 from makebreak.models.effects.kind import Effect
 
-# Test functions in which a face is pressed on, with a wrench and without. (A wall that
-# is met for half a second is seen in few: no contact that may be comes or goes in one.)
-FEWEST_SEEN = 2, 3
+FEWEST_SEEN = 3  # Test functions in which a face is pressed on.
 STILL_DEEP = 0.1  # Of the nodes at which it was: knocks go deeper, too.
 FELT, LESS = 4.0, 0.5  # Mean square of what is left where a face is felt; with it.
 MOVES = ("wall_position", "plane_height")
@@ -249,7 +247,7 @@ class FeltPlaces(FixedFaces):
             for s in geometry.slots:
                 if face.body in (s.a, s.b):
                     on |= self._when(geometry, s) > 0.999
-            if on.sum() < FEWEST_SEEN[not self.sensors]:
+            if on.sum() < FEWEST_SEEN:
                 continue
             after = self._mean_squares(trial)
             is_felt = before[on].mean() >= FELT
@@ -284,7 +282,7 @@ class FeltPlaces(FixedFaces):
             return np.asarray(self._W @ rows.astype(float)).ravel() > 0.999
 
         at, above = whole(apart < MEETS), whole((apart > PASSED) & (apart < ABOVE))
-        if min(at.sum(), above.sum()) < FEWEST_SEEN[1]:
+        if min(at.sum(), above.sum()) < FEWEST_SEEN:
             return False
         return bool(np.median(taken[above]) < GONE * np.median(taken[at]))
 
