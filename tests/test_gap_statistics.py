@@ -1225,7 +1225,7 @@ def test_a_fit_goes_beyond_what_is_searched_but_for_what_ends():
     """A patch with ever more friction would shrink to a point; what holds may have any
     friction that is enough."""
     highest = {
-        (kind, name): fit._highest(kind, name)
+        (kind, name): fit.highest(kind, name)
         for kind, name in (("friction_patch", "friction"), ("friction_patch", "x_max"),
                            ("contact_friction", "friction"))
     }  # fmt: skip
