@@ -271,11 +271,13 @@ class WindowModel(WindowedResidual):
                 grown = self._grown(
                     recording, states, spreads, slice(start_row, last), after, jumps
                 )
+                # No less than along a straight line: behind filters a smoothed state is
+                # less sure than it knows, also where the motion makes little of it.
                 for c, name in enumerate(self.channels):
+                    std[:, c] = self._std(name, c, spreads, start_row, after)
                     if name in grown:
-                        std[:, c] = np.sqrt(self.noise[c] ** 2 + grown[name])
-                    else:
-                        std[:, c] = self._std(name, c, spreads, start_row, after)
+                        own = np.sqrt(self.noise[c] ** 2 + grown[name])
+                        std[:, c] = np.maximum(std[:, c], own)
                 block_number = number
                 if number is None:
                     block_number = int((t0 - time[0]) / block)
