@@ -104,6 +104,40 @@ def test_a_tip_that_follows_something_is_tared_too():
     np.testing.assert_allclose(bias_of(memory), TRUE_BIAS, atol=0.015 + 0.03)
 
 
+def zigzag(n):
+    """(n, 6) velocities: +-0.02 m/s in ramps of 0.2 s, so that no window of 0.1 s that
+    begins with a ramp or in its middle is steady, and one of 0.4 s is."""
+    velocity = np.zeros((n, 6))
+    velocity[:, 0] = np.interp(np.arange(n) % 400, [0, 200, 400], [-0.02, 0.02, -0.02])
+    return velocity
+
+
+def test_a_first_window_that_never_is_steady_begins_anew_after_a_second():
+    """It began while the tip was still fast: 0.3 m/s are 6 s of STEADY."""
+    stops = np.zeros((109, 6))
+    stops[:, 0] = np.interp(np.arange(109), [9, 109], [0.3, -0.02])
+    velocity = np.concatenate([stops, zigzag(1900)])
+    wrench = noisy(len(velocity))
+    assert after(wrench[:1000], velocity[:1000])[STATUS] == NOT_TARED
+    assert after(wrench, velocity)[STATUS] == TARED
+
+
+def test_a_bad_wrench_ends_every_window():
+    velocity = zigzag(429)
+    velocity[9:] = zigzag(420)  # The first samples are left out.
+    wrench = noisy(429)
+    assert after(wrench, velocity)[STATUS] == TARED
+    wrench[309] = np.nan
+    assert after(wrench, velocity)[STATUS] == NOT_TARED
+
+
+def test_only_the_first_window_may_be_longer():
+    memory = after(noisy(309))  # Its last window ends here.
+    known = bias_of(memory).copy()
+    moving = after(noisy(1200, 1) + 0.3, zigzag(1200), memory=memory)
+    np.testing.assert_array_equal(bias_of(moving), known)
+
+
 def test_drift_is_followed_in_free_space_and_kept_under_pressure():
     rate = np.array([0.02, -0.01, 0.0, 0.0, 0.0, 0.0])
     t = 1e-3 * np.arange(20000)[:, None]

@@ -144,7 +144,8 @@ def tick(law, memory, wrench, velocity, force_directions):
     m[_TICKS] += 1.0
     known = m[_TARED] > 0.0
     if not is_usable(wrench, law.wrench_limit):
-        m[_STATUS], m[_N], m[_GOOD] = BAD_WRENCH, 0.0, 0.0
+        m[_STATUS] = BAD_WRENCH
+        m[_N] = m[_LONG] = m[_GOOD] = 0.0
         return m
     if known:
         m[_STATUS] = TARED
