@@ -424,16 +424,21 @@ def test_target_of_a_ball_far_off_the_path_is_within_reach_and_towards_the_path(
     np.testing.assert_allclose(way, [expected] * 3, atol=1e-15)
 
 
+def phase_after_a_push(tip, ball):
+    """The phase a tick after a push with the tip and the ball there."""
+    x = pack(tip, np.zeros(3), ball, np.zeros(3), R_BALL)
+    state = TaskState(ROLL, 0.0, tip, np.zeros(3), np.zeros(3))
+    state = next_state(
+        RollingConfig(), PATH, state, 0.1, DT, x, 0.0, True, R_BALL, R_TIP
+    )  # fmt: skip
+    return state.phase
+
+
 def test_push_is_over_when_the_tip_is_in_front_of_the_ball():
     ball = np.array([0.6, 0.0, R_BALL])
     for ahead, phase in ((0.02, ROLL), (0.03, REPOSITION)):
         tip = ball + [0.0, ahead, 0.04]
-        x = pack(tip, np.zeros(3), ball, np.zeros(3), R_BALL)
-        state = TaskState(ROLL, 0.0, tip, np.zeros(3), np.zeros(3))
-        state = next_state(
-            RollingConfig(), PATH, state, 0.1, DT, x, 0.0, True, R_BALL, R_TIP
-        )  # fmt: skip
-        assert state.phase == phase
+        assert phase_after_a_push(tip, ball) == phase
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
@@ -441,12 +446,7 @@ def test_push_is_over_when_the_ball_has_rolled_away_sideways(side):
     ball = np.array([0.6, 0.0, R_BALL])
     for off, phase in ((0.02, ROLL), (0.03, REPOSITION)):
         tip = ball + [side * off, 0.0, 0.04]  # Across the path.
-        x = pack(tip, np.zeros(3), ball, np.zeros(3), R_BALL)
-        state = TaskState(ROLL, 0.0, tip, np.zeros(3), np.zeros(3))
-        state = next_state(
-            RollingConfig(), PATH, state, 0.1, DT, x, 0.0, True, R_BALL, R_TIP
-        )  # fmt: skip
-        assert state.phase == phase
+        assert phase_after_a_push(tip, ball) == phase
 
 
 def test_a_tip_behind_the_ball_goes_on_pushing_as_far_as_it_can_touch_it():
@@ -454,12 +454,7 @@ def test_a_tip_behind_the_ball_goes_on_pushing_as_far_as_it_can_touch_it():
     reach = R_BALL + R_TIP
     for behind, phase in ((0.03, ROLL), (reach - 1e-3, ROLL), (0.06, REPOSITION)):
         tip = np.append(ball[:2] - behind * PATH.heading(ball), R_BALL + 0.03)
-        x = pack(tip, np.zeros(3), ball, np.zeros(3), R_BALL)
-        state = TaskState(ROLL, 0.0, tip, np.zeros(3), np.zeros(3))
-        state = next_state(
-            RollingConfig(), PATH, state, 0.1, DT, x, 0.0, True, R_BALL, R_TIP
-        )  # fmt: skip
-        assert state.phase == phase
+        assert phase_after_a_push(tip, ball) == phase
 
 
 def approach(surface, gap_std, T=3.0, v_ball=lambda t: np.zeros(2)):
