@@ -148,7 +148,8 @@ def _values(
             found.setdefault(name, {})[recording] = value
     for one in told:
         if (named := _of(one, _key(effect))) is not None:
-            here = {n: (p.value, p.std) for n, p in named.parameters.items()}
+            fitted = {n: p for n, p in named.parameters.items() if p.fitted}
+            here = {n: (p.value, p.std) for n, p in fitted.items()}
         else:
             here = _beside(one, effect.effect())
         for name, value in here.items():
@@ -248,9 +249,13 @@ def _effects(
 
 
 def _surest(named: NamedEffect) -> float:
-    """The smallest relative deviation of the parameters."""
+    """The smallest relative deviation of the parameters that were fitted."""
     return min(
-        (p.std / max(abs(p.value), 1e-12) for p in named.parameters.values()),
+        (
+            p.std / max(abs(p.value), 1e-12)
+            for p in named.parameters.values()
+            if p.fitted
+        ),
         default=np.inf,
     )
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from makebreak.gap.data.findings import Finding
-from makebreak.models.effects.kind import Effect
+from makebreak.models.effects.kind import Effect, with_deviation
 
 VERDICTS = ("no_gap", "not_judged", "gap_named", "ambiguous", "gap_unnamed")
 # Those that find no gap, as far as anything was compared.
@@ -34,12 +34,19 @@ class Where:
 @dataclass(frozen=True)
 class Estimate:
     """A parameter's value, and how sure it is. or_more: it may as well be any larger;
-    the deviation is then that of the least that it can be."""
+    the deviation is then that of the least that it can be. fitted: if not, the value
+    is the model's own, which these data do not tell."""
 
     value: float
     std: float
     unit: str
     or_more: bool = False
+    fitted: bool = True
+
+    def text(self) -> str:
+        """ "0.350 +- 0.010", "0 (as modelled)": without the unit."""
+        as_it_was = "" if self.fitted else " (as modelled)"
+        return with_deviation(self.value, self.std, self.or_more) + as_it_was
 
 
 @dataclass(frozen=True)
@@ -308,9 +315,10 @@ def _effect_json(each: NamedEffect) -> dict[str, Any]:
         "parameters": {
             name: {
                 "value": _number(p.value),
-                "std": _number(p.std),
+                "std": _number(p.std if p.fitted else float("nan")),
                 "unit": p.unit,
                 "or_more": p.or_more,
+                "fitted": p.fitted,
             }
             for name, p in each.parameters.items()
         },

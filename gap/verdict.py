@@ -149,7 +149,8 @@ def named(choice: Choice, plant: MultibodyPlant, beside: str = "") -> NamedEffec
         weak |= spread > max(abs(value), 1e-3 * width)
         unit = own_unit if each.unit == OF_CHANNEL else unit_at(each.unit, slides)
         or_more = each.name in choice.or_more
-        parameters[each.name] = Estimate(value, spread, unit, or_more)
+        is_fitted = each.name not in choice.fixed
+        parameters[each.name] = Estimate(value, spread, unit, or_more, is_fitted)
         if spread > 0.0:
             std[each.name] = spread
     apart = ""

@@ -19,7 +19,6 @@ from makebreak.gap.report.comparison import comparison_html
 from makebreak.gap.report.files import write_report
 from makebreak.gap.report.summary import next_best, summary_lines, windows_of
 from makebreak.gap.result import GapResult
-from makebreak.models.effects.kind import with_deviation
 from makebreak.models.scene import Scene, read_scene
 from makebreak.models.typed_yaml import read_yaml
 from makebreak.scripts.interrupts import undisturbed
@@ -221,7 +220,7 @@ def effects_table(result: GapResult) -> Table:
     rows: list[tuple] = []
     for each in result.effects:
         values = ", ".join(
-            f"{name} {with_deviation(p.value, p.std, p.or_more)} {p.unit}".rstrip()
+            f"{name} {p.text()} {p.unit}".rstrip()
             for name, p in each.parameters.items()
         )
         rows.append((each.kind, list(each.at), values, next_best(each.evidence) or "-"))

@@ -657,9 +657,12 @@ def test_a_parameter_that_was_not_fitted_is_said_to_be_as_modelled():
     choice = Choice(
         com, {"x": 1e-4, "y": 1e-4}, 2.0, 0.8, "", 1.0, (), fixed=("z",), size=2
     )
-    says = named(choice, None).says  # type: ignore[arg-type]
+    found = named(choice, None)  # type: ignore[arg-type]
+    says = found.says
     assert "x = 0.01500 +- 0.00010 m y = -0.01000 +- 0.00010 m" in says
     assert "z = 0 m (as modelled)" in says and says.count("as modelled") == 1
+    assert found.parameters["z"].text() == "0 (as modelled)"
+    assert found.parameters["x"].text() == "0.01500 +- 0.00010"
 
 
 @pytest.mark.parametrize(

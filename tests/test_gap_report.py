@@ -11,6 +11,7 @@ from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.math import RotationMatrix
 from pydrake.systems.framework import DiagramBuilder
 
+from makebreak.gap.by_recording import _surest
 from makebreak.gap.data.findings import Finding
 from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.data.table import write_recording
@@ -316,6 +317,21 @@ def test_numbers_that_are_none_do_not_break_it(case, tmp_path):
     page = written(case, tmp_path, result)
     assert "nan" not in text_of(page)
     json.loads((tmp_path / "result.json").read_text(), parse_constant=pytest.fail)
+
+
+def test_a_parameter_that_was_not_fitted_has_no_deviation(case, tmp_path):
+    """Neither in the page nor in result.json; nor does it make an effect sure."""
+    values = {
+        "x": Estimate(0.015, 1e-3, "m"),
+        "z": Estimate(0.0, 0.0, "m", False, False),
+    }
+    effect = replace(case[2].effects[0], parameters=values)
+    page = written(case, tmp_path, replace(case[2], effects=[effect]))
+    assert "0 (as modelled)" in text_of(page)
+    found = json.loads((tmp_path / "result.json").read_text())["effects"][0]
+    assert found["parameters"]["z"]["std"] is None
+    assert [p["fitted"] for p in found["parameters"].values()] == [True, False]
+    assert _surest(effect) == pytest.approx(1e-3 / 0.015)
 
 
 def test_text_of_a_recording_is_no_html(case, tmp_path):

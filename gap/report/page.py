@@ -17,7 +17,6 @@ from makebreak.gap.report.summary import (
     windows_of,
 )
 from makebreak.gap.result import GapResult, NamedEffect, Unexplained
-from makebreak.models.effects.kind import with_deviation
 
 
 def report_html(
@@ -91,7 +90,7 @@ def _doubts(result: GapResult) -> str:
 def _effect(each: NamedEffect, result: GapResult, i: int) -> str:
     rows = ""
     for name, p in each.parameters.items():
-        value = sentence_html(with_deviation(p.value, p.std, p.or_more))
+        value = sentence_html(p.text())
         rows += f"<tr><td>{escape(name)}</td><td class=n>{value}</td>"
         rows += f"<td>{escape(p.unit)}</td></tr>"
     other = next_best(each.evidence)
