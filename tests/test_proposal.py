@@ -57,6 +57,15 @@ def test_columns_are_matched_by_their_names(names, expected):
         assert found[name] == (channel and f"panda.panda_joint{channel}"), name
 
 
+def test_of_columns_without_a_name_the_one_with_even_steps_is_the_time():
+    """What drifts (an encoder that counts on, or a sum) is none."""
+    drifting = np.cumsum(1e-3 * np.exp(2.0 * np.sin(9.0 * T)))
+    columns = {"column_1": drifting, "column_2": np.sin(T), "column_3": 900.0 + T}
+    found = propose(columns, PANDA)
+    assert [m.channel for m in found] == [None, None, "time"]
+    assert "does not name it" in found[0].why
+
+
 def test_a_unit_tells_what_a_column_is_beside_a_joints_name_alone():
     joints = [JointName("a.q1"), JointName("a.slide", prismatic=True)]
     names = {

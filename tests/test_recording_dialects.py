@@ -46,6 +46,39 @@ def test_other_ways_to_write_a_csv_are_read(tmp_path, name, content):
     assert recording.name == "a"
 
 
+NO_HEADER = "columns: {column_1: time, column_2: a.j.position}"
+
+
+@pytest.mark.parametrize(
+    "content",
+    [rows().encode(), rows(";", ",").encode(), gzip.compress(rows("\t").encode())],
+    ids=["commas", "semicolons", "gzip"],
+)
+def test_the_first_line_of_numbers_is_a_row_and_no_header(tmp_path, content):
+    file = tmp_path / ("a.csv.gz" if content[:2] == b"\x1f\x8b" else "a.csv")
+    text = gzip.decompress(content) if file.suffix == ".gz" else content
+    body = text.split(b"\n", 1)[1]
+    file.write_bytes(gzip.compress(body) if file.suffix == ".gz" else body)
+    (tmp_path / "a.yaml").write_text(NO_HEADER)
+    recording = read_recording(file)
+    np.testing.assert_array_equal(recording["a.j.position"], Q)
+    ((kind, says),) = recording.notes
+    assert kind == "no_header" and "column_1 to column_2" in says
+    # Row 3 is the third line.
+    file = tmp_path / "a.csv"
+    lines = body.decode().splitlines()
+    file.write_text("\n".join([*lines[:2], "oops", *lines[3:]]))
+    with pytest.raises(ValueError, match="row 3 has 1 cells, expected 2"):
+        read_recording(file)
+
+
+def test_numbers_that_count_the_columns_are_their_names(tmp_path):
+    (tmp_path / "a.csv").write_text(rows(header=("0", "1")))
+    (tmp_path / "a.yaml").write_text('columns: {"0": time, "1": a.j.position}')
+    recording = read_recording(tmp_path / "a.csv")
+    assert len(recording.time) == N and not recording.notes
+
+
 def test_lists_in_cells_are_columns_of_their_own(tmp_path):
     lines = ["t,q,state"] + [
         f'{t},"[{q}, {2 * q}]",moving' for t, q in zip(T, Q, strict=True)

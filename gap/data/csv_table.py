@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 _BLOCK = 1 << 23  # [bytes] of text that are parsed at a time.
+NAMELESS = "column_"  # What columns without a name are called, with their number.
 _SHOWN = 3  # Bad rows that are named one by one.
 _QUOTED = re.compile(rb'"([^"\n]*)"')
 
@@ -21,7 +22,7 @@ _QUOTED = re.compile(rb'"([^"\n]*)"')
 class Dialect:
     """How a csv file is written. names: of its columns; lists: {column: how many
     numbers its cells hold}, of cells as [1, 2, 3]; unused: columns that may hold
-    anything."""
+    anything; headless: the first line is a row, and the names are column_1, ..."""
 
     separator: str
     decimal_comma: bool
@@ -29,6 +30,7 @@ class Dialect:
     names: tuple[str, ...]
     lists: dict[str, int] = field(default_factory=dict)
     unused: frozenset[str] = frozenset()
+    headless: bool = False
 
     def columns(self) -> list[str]:
         """Names of the columns of numbers: a list's are name[0], name[1], ..."""
@@ -51,6 +53,7 @@ class BadRows:
         self._path, self.skip = path, skip
         self.count, self.why = 0, list[str]()
         self.twice = 0  # Rows that are the row before once more.
+        self.headless = 0  # Columns of a file that does not name them.
 
     def add(self, why: str) -> None:
         """Raises: ValueError with the reason, unless such rows are left out."""
@@ -64,6 +67,10 @@ class BadRows:
 
     def note(self) -> list[tuple[str, str]]:
         found = []
+        if self.headless:
+            says = f"{self._path.name} has no header: its columns are called "
+            says += f"{NAMELESS}1 to {NAMELESS}{self.headless}"
+            found.append(("no_header", says))
         if self.twice:
             says = f"{self._path.name}: {self.twice} rows are the row before once more "
             found.append(("rows_twice", says + "(time and all values): left out"))
@@ -105,7 +112,13 @@ def dialect_of(
     separator = max(",;\t", key=plain.count)
     if not plain.count(separator):
         separator = ","
+    for other in ";\t":  # "0,1;0,2" has as many decimal commas as separators.
+        if other in plain and _are_values(plain.split(other), other):
+            separator = other
     names = [n.strip() for n in next(csv.reader([text], delimiter=separator), [])]
+    headless = _are_values(names, separator)
+    if headless:
+        names = [f"{NAMELESS}{i + 1}" for i in range(len(names))]
     for name in names:
         if names.count(name) > 1:
             raise ValueError(f'recording {path}: column "{name}" is there twice')
@@ -124,7 +137,19 @@ def dialect_of(
     # Numbers in quotes with a comma in them, between commas.
     comma |= separator == "," and re.search(r'"-?\d+,\d+"', body) is not None
     unused = unused & set(names)
-    return Dialect(separator, comma, '"' in body, tuple(names), lists, unused)
+    return Dialect(separator, comma, '"' in body, tuple(names), lists, unused, headless)
+
+
+def _are_values(cells: Sequence[str], separator: str) -> bool:
+    """Whether a first line holds a row's numbers rather than names. Whole numbers that
+    count up by one are names, as pandas writes them for want of others."""
+    texts = [c.replace(",", ".") if separator != "," else c for c in cells if c]
+    try:
+        values = np.array([float(text) for text in texts])
+    except ValueError:
+        return False
+    counted = all(text.isdigit() for text in texts) and np.all(np.diff(values) == 1.0)
+    return len(values) > 1 and np.isfinite(values).any() and not counted
 
 
 def _list(cell: str) -> list[float] | None:

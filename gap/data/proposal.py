@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import yaml
 
+from makebreak.gap.data.csv_table import NAMELESS
 from makebreak.gap.data.table import COMMANDS, is_channel
 
 DEG = np.pi / 180.0
@@ -124,7 +125,10 @@ def propose(
             continue
         quantity = _quantity(name, [j for j in joints if _names(name, j)])
         if quantity is None:
-            found[name] = Match(name, None, why="not a quantity that gap compares")
+            why = "not a quantity that gap compares"
+            if name.startswith(NAMELESS):
+                why = "the file does not name it: say here what it is"
+            found[name] = Match(name, None, why=why)
         else:
             quantities[name] = quantity
     listed = _listed(text, joints)
@@ -395,7 +399,7 @@ def _once(found: dict[str, Match], said: Mapping[str, Match]) -> dict[str, Match
 
 def _find_time(columns: Mapping[str, np.ndarray]) -> Match | None:
     """The first column that increases and has a word for time in its name, or a unit of
-    it in brackets (in any language)."""
+    it in brackets (in any language), or no name and even steps."""
     for name, value in columns.items():
         words = words_of(name)
         if not (
@@ -403,6 +407,8 @@ def _find_time(columns: Mapping[str, np.ndarray]) -> Match | None:
             or words
             and words[0] in _TIME_UNITS
             or re.search(r"[\[(](ns|us|ms|s|sec)[\])]\s*$", name.lower())
+            or name.startswith(NAMELESS)
+            and _is_even(value)
         ):
             continue
         step = np.diff(value[np.isfinite(value)])
@@ -421,6 +427,13 @@ def _find_time(columns: Mapping[str, np.ndarray]) -> Match | None:
         why = f"increases, {typical * scale * 1e3:.3g} ms a row, taken as {unit}"
         return Match(name, "time", scale, why=why)
     return None
+
+
+def _is_even(value: np.ndarray) -> bool:
+    """Whether nearly all steps are positive and within half of the usual one."""
+    step = np.diff(value)
+    typical = np.median(step) if len(step) else 0.0
+    return bool(np.mean(np.abs(step - typical) < 0.5 * typical) > 0.9)
 
 
 def _counts(value: np.ndarray) -> bool:

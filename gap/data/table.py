@@ -8,7 +8,8 @@
     <model>.<frame>.fx .fy .fz .tx .ty .tz       wrench on the robot, in world
 
 SI units; an empty cell (NaN) is a missing sample. docs/recordings.md says the rest.
-Rows are counted from 1 in all messages; a csv's first row is the one under its header.
+Rows are counted from 1 in all messages; a csv's first row is the one under its header,
+if it has one.
 """
 
 import gzip
@@ -251,6 +252,9 @@ def _read_csv(path: Path, most_cells: int, bad: BadRows, unused) -> RecordingTab
             body_start = file.tell()
             sample = file.read(1 << 20)
             dialect = dialect_of(path, header, sample, unused)
+            if dialect.headless:
+                body_start, sample = 0, header + sample
+                bad.headless = len(dialect.names)
             names = dialect.columns()
             rows_per_byte = max(sample.count(b"\n"), 1) / max(len(sample), 1)
             # An estimate is enough to choose from; 5 % more costs nothing.
