@@ -1,4 +1,4 @@
-"""A free rigid body with spheres that touches fixed boxes and half-spaces.
+"""Free rigid bodies with spheres, which touch fixed boxes, half-spaces and each other.
 
 The law is that of Drake's continuous point contact, so that what is fitted here holds
 there; it is stepped a hundred times as fast, for searches over thousands of windows:
@@ -56,6 +56,31 @@ class FreeBody:
             raise ValueError(f"FreeBody.pairs is {self.pairs.shape}, expected {shape}")
 
 
+@dataclass(frozen=True, eq=False)
+class FreeBodies:
+    """Bodies that touch the same fixed shapes, under one gravity, and each other.
+
+    mutual (n, n, 6): of two spheres of different bodies, all bodies' spheres in a row,
+    the first one before the second: as FreeBody.pairs has them, with the share of the
+    contact point that lies on the first one's surface; 0 where they do not touch.
+    """
+
+    each: tuple[FreeBody, ...]
+    mutual: np.ndarray
+
+    def __post_init__(self):
+        n = sum(len(body.spheres) for body in self.each)
+        if self.mutual.shape != (n, n, 6):
+            raise ValueError(
+                f"FreeBodies.mutual is {self.mutual.shape}, expected {(n, n, 6)}"
+            )
+
+
+def alone(body: FreeBody) -> FreeBodies:
+    """One body, which touches nothing but what is fixed."""
+    return FreeBodies((body,), np.zeros((len(body.spheres),) * 2 + (6,)))
+
+
 def simulate(
     body: FreeBody, start, times, max_step: float = 0.01, tol: float = 1e-5
 ) -> np.ndarray:
@@ -66,11 +91,35 @@ def simulate(
         velocities [m/s], and a tenth of it of positions [m].
     Returns: NaN from where the steps became too short.
     """
+    start = np.asarray(start, float)[None]
+    return simulate_all(alone(body), start, times, max_step, tol)[:, 0]
+
+
+def simulate_all(
+    bodies: FreeBodies, start, times, max_step: float = 0.01, tol: float = 1e-5
+) -> np.ndarray:
+    """(n, n_bodies, 13); start (n_bodies, 13), the rest as of simulate()."""
+    each = bodies.each
+    count = [len(body.spheres) for body in each]
+
+    def owned(rows, width: int) -> np.ndarray:
+        """Rows of all bodies, with the number of the body in a last column."""
+        own = [np.column_stack([x, np.full(len(x), k)]) for k, x in enumerate(rows)]
+        return np.concatenate(own).reshape(-1, width + 1)
+
     return _run(
-        np.asarray(start, float), np.asarray(times, float), body.mass, body.com,
-        np.ascontiguousarray(body.inertia), np.linalg.inv(body.inertia), body.gravity,
-        body.spheres, body.fixed, body.pairs, body.levers, body.forces, body.drag,
-        body.slip, body.fade, body.patches, max_step, tol,
+        np.array(start, float), np.asarray(times, float),
+        np.array([float(body.mass) for body in each]),
+        np.array([body.com for body in each]),
+        np.array([body.inertia for body in each]),
+        np.array([np.linalg.inv(body.inertia) for body in each]),
+        each[0].gravity, np.concatenate([body.spheres for body in each]),
+        np.repeat(np.arange(len(each)), count), each[0].fixed,
+        np.concatenate([body.pairs for body in each]),
+        np.concatenate([body.levers for body in each]), bodies.mutual,
+        owned([body.forces for body in each], 6),
+        np.array([body.drag for body in each]), each[0].slip, each[0].fade,
+        owned([body.patches for body in each], 6), max_step, tol,
     )  # fmt: skip
 
 
@@ -81,13 +130,21 @@ def placed(pose, points) -> np.ndarray:
 
 def lowest_gap(body: FreeBody, pose) -> float:
     """Least distance of a sphere to what is fixed [m]; pose (7,) as in `start`."""
+    return nearest(body, pose)[0]
+
+
+def nearest(body: FreeBody, pose) -> tuple[float, np.ndarray, int]:
+    """Least distance of a sphere to what is fixed [m], the normal there (3,), out of
+    what is fixed, and which of the fixed shapes it is (-1: there is none)."""
     R, p = _matrix(np.asarray(pose[:4], float)), np.asarray(pose[4:7], float)
-    gap = np.inf
+    found = (np.inf, np.array([0.0, 0.0, 1.0]), -1)
     for sphere in body.spheres:
         c = p + R @ sphere[:3]
-        for each in body.fixed:
-            gap = min(gap, _gap(c, sphere[3], each)[0])
-    return float(gap)
+        for k, each in enumerate(body.fixed):
+            gap, n = _gap(c, sphere[3], each)
+            if gap < found[0]:
+                found = (float(gap), n, k)
+    return found
 
 
 @njit(cache=True)
@@ -163,56 +220,122 @@ def _friction(speed, slip, mu_s, mu_d):
 
 
 @njit(cache=True)
-def _rate(t, s, mass, com, inertia, inverse, gravity, spheres, fixed, pairs, levers,
-          forces, drag, slip, fade, patches, dx):  # fmt: skip
-    """State s: quaternion (4), centre of mass (3), w in world (3), its velocity (3)."""
-    R = _matrix(s[:4])
-    w0, w1, w2 = s[7], s[8], s[9]
-    F = np.empty(3)
-    T = np.zeros(3)
-    o = np.empty(3)  # The origin from the centre of mass.
-    for i in range(3):
-        F[i] = mass * gravity[i]
-        o[i] = -(R[i, 0] * com[0] + R[i, 1] * com[1] + R[i, 2] * com[2])
-    f = np.zeros(3)
-    f[0] = -drag[0] * (s[10] + w1 * o[2] - w2 * o[1])
-    f[1] = -drag[0] * (s[11] + w2 * o[0] - w0 * o[2])
-    f[2] = -drag[0] * (s[12] + w0 * o[1] - w1 * o[0])
+def _push(F, T, b, a0, a1, a2, f0, f1, f2):
+    """Adds a force at an arm from the centre of mass of body b."""
+    F[b, 0] += f0
+    F[b, 1] += f1
+    F[b, 2] += f2
+    T[b, 0] += a1 * f2 - a2 * f1
+    T[b, 1] += a2 * f0 - a0 * f2
+    T[b, 2] += a0 * f1 - a1 * f0
+
+
+@njit(cache=True)
+def _meet(F, T, s, c, spheres, owner, i, j, law, slip):
+    """Contact of the spheres i and j of two bodies."""
+    n0, n1, n2 = c[i, 0] - c[j, 0], c[i, 1] - c[j, 1], c[i, 2] - c[j, 2]
+    apart = n0 * n0 + n1 * n1 + n2 * n2
+    reach = spheres[i, 3] + spheres[j, 3]
+    if apart >= reach * reach or apart < 1e-24:
+        return
+    apart = np.sqrt(apart)
+    depth = reach - apart
+    n0, n1, n2 = n0 / apart, n1 / apart, n2 / apart
+    ri = spheres[i, 3] - (1.0 - law[4]) * depth
+    rj = apart - ri
+    a, b = owner[i], owner[j]
+    a0, a1, a2 = (
+        c[i, 0] - s[a, 4] - ri * n0,
+        c[i, 1] - s[a, 5] - ri * n1,
+        c[i, 2] - s[a, 6] - ri * n2,
+    )
+    b0, b1, b2 = (
+        c[j, 0] - s[b, 4] + rj * n0,
+        c[j, 1] - s[b, 5] + rj * n1,
+        c[j, 2] - s[b, 6] + rj * n2,
+    )
+    u0 = s[a, 10] + s[a, 8] * a2 - s[a, 9] * a1
+    u1 = s[a, 11] + s[a, 9] * a0 - s[a, 7] * a2
+    u2 = s[a, 12] + s[a, 7] * a1 - s[a, 8] * a0
+    u0 -= s[b, 10] + s[b, 8] * b2 - s[b, 9] * b1
+    u1 -= s[b, 11] + s[b, 9] * b0 - s[b, 7] * b2
+    u2 -= s[b, 12] + s[b, 7] * b1 - s[b, 8] * b0
+    un = u0 * n0 + u1 * n1 + u2 * n2
+    fn = law[0] * depth * (1.0 - law[1] * un) - law[5] * un
+    if fn <= 0.0:
+        return
+    u0 -= un * n0
+    u1 -= un * n1
+    u2 -= un * n2
+    speed = np.sqrt(u0 * u0 + u1 * u1 + u2 * u2)
+    share = 0.0
+    if speed > 1e-14:
+        share = _friction(speed, slip, law[2], law[3]) * fn / speed
+    f0, f1, f2 = fn * n0 - share * u0, fn * n1 - share * u1, fn * n2 - share * u2
+    _push(F, T, a, a0, a1, a2, f0, f1, f2)
+    _push(F, T, b, b0, b1, b2, -f0, -f1, -f2)
+
+
+@njit(cache=True)
+def _rate(t, s, mass, com, inertia, inverse, gravity, spheres, owner, fixed, pairs,
+          levers, mutual, forces, drag, slip, fade, patches, dx):  # fmt: skip
+    """State s (n_bodies, 13): quaternion (4), centre of mass (3), w in world (3), its
+    velocity (3)."""
+    N = len(mass)
+    turned = np.empty((N, 3, 3))
+    F = np.empty((N, 3))
+    T = np.empty((N, 3))
+    f = np.empty((N, 3))  # On the origin.
+    o = np.empty((N, 3))  # The origin from the centre of mass.
+    for b in range(N):
+        R = _matrix(s[b, :4])
+        turned[b] = R
+        w0, w1, w2 = s[b, 7], s[b, 8], s[b, 9]
+        for i in range(3):
+            F[b, i] = mass[b] * gravity[i]
+            o[b, i] = -(R[i, 0] * com[b, 0] + R[i, 1] * com[b, 1] + R[i, 2] * com[b, 2])
+        f[b, 0] = -drag[b, 0] * (s[b, 10] + w1 * o[b, 2] - w2 * o[b, 1])
+        f[b, 1] = -drag[b, 0] * (s[b, 11] + w2 * o[b, 0] - w0 * o[b, 2])
+        f[b, 2] = -drag[b, 0] * (s[b, 12] + w0 * o[b, 1] - w1 * o[b, 0])
     for j in range(len(forces)):
         size = 1.0
         if forces[j, 3] > 0.0:
             size = np.sin(2.0 * np.pi * forces[j, 3] * t + forces[j, 4])
         for i in range(3):
-            f[i] += size * forces[j, i]
-    T[0] = o[1] * f[2] - o[2] * f[1] - drag[1] * w0
-    T[1] = o[2] * f[0] - o[0] * f[2] - drag[1] * w1
-    T[2] = o[0] * f[1] - o[1] * f[0] - drag[1] * w2
-    for i in range(3):
-        F[i] += f[i]
-    c = np.empty(3)
+            f[int(forces[j, 6]), i] += size * forces[j, i]
+    for b in range(N):
+        for i in range(3):
+            T[b, i] = -drag[b, 1] * s[b, 7 + i]
+        _push(F, T, b, o[b, 0], o[b, 1], o[b, 2], f[b, 0], f[b, 1], f[b, 2])
+    c = np.empty((len(spheres), 3))
+    b, R = -1, turned[0]
     for j in range(len(spheres)):
+        if owner[j] != b:
+            b = owner[j]
+            R = turned[b]
+            w0, w1, w2 = s[b, 7], s[b, 8], s[b, 9]
         b0, b1, b2 = (
-            spheres[j, 0] - com[0],
-            spheres[j, 1] - com[1],
-            spheres[j, 2] - com[2],
+            spheres[j, 0] - com[b, 0],
+            spheres[j, 1] - com[b, 1],
+            spheres[j, 2] - com[b, 2],
         )
         for i in range(3):
-            c[i] = s[4 + i] + R[i, 0] * b0 + R[i, 1] * b1 + R[i, 2] * b2
+            c[j, i] = s[b, 4 + i] + R[i, 0] * b0 + R[i, 1] * b1 + R[i, 2] * b2
         radius = spheres[j, 3]
         for m in range(len(fixed)):
-            if _is_apart(c[0], c[1], c[2], radius, fixed[m]):
+            if _is_apart(c[j, 0], c[j, 1], c[j, 2], radius, fixed[m]):
                 continue
-            gap, n = _gap(c, radius, fixed[m])
+            gap, n = _gap(c[j], radius, fixed[m])
             if gap >= 0.0:
                 continue
             depth = -gap
             reach = radius - (1.0 - pairs[j, m, 4]) * depth
-            a0 = c[0] - s[4] - reach * n[0]
-            a1 = c[1] - s[5] - reach * n[1]
-            a2 = c[2] - s[6] - reach * n[2]
-            u0 = s[10] + w1 * a2 - w2 * a1
-            u1 = s[11] + w2 * a0 - w0 * a2
-            u2 = s[12] + w0 * a1 - w1 * a0
+            a0 = c[j, 0] - s[b, 4] - reach * n[0]
+            a1 = c[j, 1] - s[b, 5] - reach * n[1]
+            a2 = c[j, 2] - s[b, 6] - reach * n[2]
+            u0 = s[b, 10] + w1 * a2 - w2 * a1
+            u1 = s[b, 11] + w2 * a0 - w0 * a2
+            u2 = s[b, 12] + w0 * a1 - w1 * a0
             un = u0 * n[0] + u1 * n[1] + u2 * n[2]
             fn = pairs[j, m, 0] * depth * (1.0 - pairs[j, m, 1] * un)
             fn -= pairs[j, m, 5] * un
@@ -228,8 +351,9 @@ def _rate(t, s, mass, com, inertia, inverse, gravity, spheres, fixed, pairs, lev
                 for k in range(len(patches)):
                     if (
                         patches[k, 0] == m
-                        and patches[k, 2] < c[0] < patches[k, 3]
-                        and patches[k, 4] < c[1] < patches[k, 5]
+                        and patches[k, 6] == b
+                        and patches[k, 2] < c[j, 0] < patches[k, 3]
+                        and patches[k, 4] < c[j, 1] < patches[k, 5]
                     ):
                         mu_s = mu_d = patches[k, 1]
                 mu = _friction(speed, slip, mu_s, mu_d)
@@ -237,60 +361,74 @@ def _rate(t, s, mass, com, inertia, inverse, gravity, spheres, fixed, pairs, lev
             f0 = fn * n[0] - share * u0
             f1 = fn * n[1] - share * u1
             f2 = fn * n[2] - share * u2
-            F[0] += f0
-            F[1] += f1
-            F[2] += f2
-            T[0] += a1 * f2 - a2 * f1
-            T[1] += a2 * f0 - a0 * f2
-            T[2] += a0 * f1 - a1 * f0
+            _push(F, T, b, a0, a1, a2, f0, f1, f2)
             if levers[j, m] > 0.0:
                 wn = w0 * n[0] + w1 * n[1] + w2 * n[2]
                 t0, t1, t2 = w0 - wn * n[0], w1 - wn * n[1], w2 - wn * n[2]
                 turn = max(np.sqrt(t0 * t0 + t1 * t1 + t2 * t2), fade)
-                T[0] -= levers[j, m] * fn / turn * t0
-                T[1] -= levers[j, m] * fn / turn * t1
-                T[2] -= levers[j, m] * fn / turn * t2
-    dx[0] = 0.5 * (-s[1] * w0 - s[2] * w1 - s[3] * w2)
-    dx[1] = 0.5 * (s[0] * w0 + w1 * s[3] - w2 * s[2])
-    dx[2] = 0.5 * (s[0] * w1 + w2 * s[1] - w0 * s[3])
-    dx[3] = 0.5 * (s[0] * w2 + w0 * s[2] - w1 * s[1])
-    for i in range(3):
-        dx[4 + i] = s[10 + i]
-        dx[10 + i] = F[i] / mass
-    # Euler's equation in the body's axes.
+                T[b, 0] -= levers[j, m] * fn / turn * t0
+                T[b, 1] -= levers[j, m] * fn / turn * t1
+                T[b, 2] -= levers[j, m] * fn / turn * t2
+        for i in range(j):
+            if owner[i] == b:  # So are all that follow.
+                break
+            if mutual[i, j, 0] > 0.0:
+                _meet(F, T, s, c, spheres, owner, i, j, mutual[i, j], slip)
     wb, tb, h = np.empty(3), np.empty(3), np.empty(3)
-    for i in range(3):
-        wb[i] = R[0, i] * w0 + R[1, i] * w1 + R[2, i] * w2
-        tb[i] = R[0, i] * T[0] + R[1, i] * T[1] + R[2, i] * T[2]
-    for i in range(3):
-        h[i] = inertia[i, 0] * wb[0] + inertia[i, 1] * wb[1] + inertia[i, 2] * wb[2]
-    tb[0] -= wb[1] * h[2] - wb[2] * h[1]
-    tb[1] -= wb[2] * h[0] - wb[0] * h[2]
-    tb[2] -= wb[0] * h[1] - wb[1] * h[0]
-    for i in range(3):
-        h[i] = inverse[i, 0] * tb[0] + inverse[i, 1] * tb[1] + inverse[i, 2] * tb[2]
-    for i in range(3):
-        dx[7 + i] = R[i, 0] * h[0] + R[i, 1] * h[1] + R[i, 2] * h[2]
+    for b in range(N):
+        R = turned[b]
+        w0, w1, w2 = s[b, 7], s[b, 8], s[b, 9]
+        dx[b, 0] = 0.5 * (-s[b, 1] * w0 - s[b, 2] * w1 - s[b, 3] * w2)
+        dx[b, 1] = 0.5 * (s[b, 0] * w0 + w1 * s[b, 3] - w2 * s[b, 2])
+        dx[b, 2] = 0.5 * (s[b, 0] * w1 + w2 * s[b, 1] - w0 * s[b, 3])
+        dx[b, 3] = 0.5 * (s[b, 0] * w2 + w0 * s[b, 2] - w1 * s[b, 1])
+        for i in range(3):
+            dx[b, 4 + i] = s[b, 10 + i]
+            dx[b, 10 + i] = F[b, i] / mass[b]
+        # Euler's equation in the body's axes.
+        for i in range(3):
+            wb[i] = R[0, i] * w0 + R[1, i] * w1 + R[2, i] * w2
+            tb[i] = R[0, i] * T[b, 0] + R[1, i] * T[b, 1] + R[2, i] * T[b, 2]
+        for i in range(3):
+            h[i] = (
+                inertia[b, i, 0] * wb[0]
+                + inertia[b, i, 1] * wb[1]
+                + inertia[b, i, 2] * wb[2]
+            )
+        tb[0] -= wb[1] * h[2] - wb[2] * h[1]
+        tb[1] -= wb[2] * h[0] - wb[0] * h[2]
+        tb[2] -= wb[0] * h[1] - wb[1] * h[0]
+        for i in range(3):
+            h[i] = (
+                inverse[b, i, 0] * tb[0]
+                + inverse[b, i, 1] * tb[1]
+                + inverse[b, i, 2] * tb[2]
+            )
+        for i in range(3):
+            dx[b, 7 + i] = R[i, 0] * h[0] + R[i, 1] * h[1] + R[i, 2] * h[2]
 
 
 @njit(cache=True)
-def _run(start, times, mass, com, inertia, inverse, gravity, spheres, fixed, pairs,
-         levers, forces, drag, slip, fade, patches, max_step, tol):  # fmt: skip
-    n = len(times)
-    out = np.full((n, 13), np.nan)
+def _run(start, times, mass, com, inertia, inverse, gravity, spheres, owner, fixed,
+         pairs, levers, mutual, forces, drag, slip, fade, patches, max_step,
+         tol):  # fmt: skip
+    n, N = len(times), len(mass)
+    out = np.full((n, N, 13), np.nan)
     s = start.copy()
-    s[:4] /= np.sqrt(np.sum(s[:4] ** 2))
-    a = _matrix(s[:4]) @ com
-    s[4:7] += a
-    s[10] += s[8] * a[2] - s[9] * a[1]
-    s[11] += s[9] * a[0] - s[7] * a[2]
-    s[12] += s[7] * a[1] - s[8] * a[0]
+    for b in range(N):
+        s[b, :4] /= np.sqrt(np.sum(s[b, :4] ** 2))
+        a = _matrix(s[b, :4]) @ com[b]
+        s[b, 4:7] += a
+        s[b, 10] += s[b, 8] * a[2] - s[b, 9] * a[1]
+        s[b, 11] += s[b, 9] * a[0] - s[b, 7] * a[2]
+        s[b, 12] += s[b, 7] * a[1] - s[b, 8] * a[0]
     scale = np.empty(13)
     scale[:4], scale[4:7], scale[7:10], scale[10:] = tol, 0.1 * tol, 20 * tol, tol
-    k1, k2, k3, k4 = np.empty(13), np.empty(13), np.empty(13), np.empty(13)
+    k1, k2 = np.empty((N, 13)), np.empty((N, 13))
+    k3, k4 = np.empty((N, 13)), np.empty((N, 13))
     t, h, steps = times[0], 1e-4, 0
-    _rate(t, s, mass, com, inertia, inverse, gravity, spheres, fixed, pairs, levers,
-          forces, drag, slip, fade, patches, k1)  # fmt: skip
+    _rate(t, s, mass, com, inertia, inverse, gravity, spheres, owner, fixed, pairs,
+          levers, mutual, forces, drag, slip, fade, patches, k1)  # fmt: skip
     for i in range(n):
         while t < times[i] - 1e-12:
             steps += 1
@@ -299,23 +437,25 @@ def _run(start, times, mass, com, inertia, inverse, gravity, spheres, fixed, pai
             h = min(h, max_step)
             step = min(h, times[i] - t)
             _rate(t + 0.5 * step, s + 0.5 * step * k1, mass, com, inertia, inverse,
-                  gravity, spheres, fixed, pairs, levers, forces, drag, slip, fade,
-                  patches, k2)  # fmt: skip
+                  gravity, spheres, owner, fixed, pairs, levers, mutual, forces, drag,
+                  slip, fade, patches, k2)  # fmt: skip
             _rate(t + 0.75 * step, s + 0.75 * step * k2, mass, com, inertia, inverse,
-                  gravity, spheres, fixed, pairs, levers, forces, drag, slip, fade,
-                  patches, k3)  # fmt: skip
+                  gravity, spheres, owner, fixed, pairs, levers, mutual, forces, drag,
+                  slip, fade, patches, k3)  # fmt: skip
             new = s + step * (2.0 / 9.0 * k1 + 1.0 / 3.0 * k2 + 4.0 / 9.0 * k3)
-            _rate(t + step, new, mass, com, inertia, inverse, gravity, spheres, fixed,
-                  pairs, levers, forces, drag, slip, fade, patches, k4)  # fmt: skip
+            _rate(t + step, new, mass, com, inertia, inverse, gravity, spheres, owner,
+                  fixed, pairs, levers, mutual, forces, drag, slip, fade, patches,
+                  k4)  # fmt: skip
             worst = 0.0
-            for j in range(13):
-                e = step * abs(
-                    -5.0 / 72.0 * k1[j] + 1.0 / 12.0 * k2[j] + 1.0 / 9.0 * k3[j]
-                    - 0.125 * k4[j]
-                ) / scale[j]  # fmt: skip
-                worst = max(worst, e)
-            if not np.isfinite(worst):
-                return out
+            for b in range(N):
+                for j in range(13):
+                    e = step * abs(
+                        -5.0 / 72.0 * k1[b, j] + 1.0 / 12.0 * k2[b, j]
+                        + 1.0 / 9.0 * k3[b, j] - 0.125 * k4[b, j]
+                    ) / scale[j]  # fmt: skip
+                    if not np.isfinite(e):
+                        return out
+                    worst = max(worst, e)
             if worst <= 1.0 or step < 1e-7:
                 t += step
                 s = new
@@ -326,12 +466,13 @@ def _run(start, times, mass, com, inertia, inverse, gravity, spheres, fixed, pai
                     h = step * min(3.0, 0.9 / max(worst, 1e-6) ** (1.0 / 3.0))
             else:
                 h = step * max(0.2, 0.9 / worst ** (1.0 / 3.0))
-        s[:4] /= np.sqrt(np.sum(s[:4] ** 2))
-        a = _matrix(s[:4]) @ com
-        out[i, :4] = s[:4]
-        out[i, 4:7] = s[4:7] - a
-        out[i, 7:10] = s[7:10]
-        out[i, 10] = s[10] - (s[8] * a[2] - s[9] * a[1])
-        out[i, 11] = s[11] - (s[9] * a[0] - s[7] * a[2])
-        out[i, 12] = s[12] - (s[7] * a[1] - s[8] * a[0])
+        for b in range(N):
+            s[b, :4] /= np.sqrt(np.sum(s[b, :4] ** 2))
+            a = _matrix(s[b, :4]) @ com[b]
+            w0, w1, w2 = s[b, 7], s[b, 8], s[b, 9]
+            out[i, b] = s[b]
+            out[i, b, 4:7] = s[b, 4:7] - a
+            out[i, b, 10] = s[b, 10] - (w1 * a[2] - w2 * a[1])
+            out[i, b, 11] = s[b, 11] - (w2 * a[0] - w0 * a[2])
+            out[i, b, 12] = s[b, 12] - (w0 * a[1] - w1 * a[0])
     return out

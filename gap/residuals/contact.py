@@ -83,7 +83,7 @@ def contact_candidates(
                 continue
             if kind in _OF_BODIES and at not in model.bodies:
                 continue
-            if kind == "object_mass" and isinstance(model, FreeBodyModel):
+            if kind == "object_mass" and _is_alone(model):
                 continue  # No force is measured: it only shows as stiffness over mass.
             if any(e.kind == kind and at in e.at for e in there):
                 continue
@@ -97,6 +97,11 @@ def contact_candidates(
                 if each is not None:
                     found.append(each)
     return found
+
+
+def _is_alone(model: FreeBodyModel | WindowModel) -> bool:
+    """Whether one body touches what is fixed and nothing else."""
+    return isinstance(model, FreeBodyModel) and len(model.bodies) == 1
 
 
 def _trials(model, kind: str, at: str):
@@ -131,7 +136,7 @@ def _trials(model, kind: str, at: str):
         if not isinstance(model, FreeBodyModel):
             return  # Drake's steps bound it, and are too long.
         stiffness = model.dynamics.now(STIFFNESS, [at])["stiffness"]
-        critical = 2.0 * np.sqrt(stiffness * model.body.mass)
+        critical = 2.0 * np.sqrt(stiffness * model.body(at).mass)
         values = [share * critical for share in _DAMPED]
         yield [[(c, {"damping": c})] for c in values], ("damping",), ()
     elif kind in _TIMES:
@@ -175,7 +180,7 @@ def _patches(model, at: str, there, r) -> list[Candidate]:
             return []  # Only level ground is cut into a patch.
         if effect.kind == "contact_friction" and at in effect.at:
             mu = effect.parameters["friction"]
-    places = touched(model)
+    places = touched(model, at)
     if mu <= 0.0 or len(places) < 2 * CELLS:
         return []
     grid = [np.linspace(c.min() - 1e-3, c.max() + 1e-3, CELLS + 1) for c in places.T]

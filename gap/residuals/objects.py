@@ -128,7 +128,7 @@ class WindowedProblem(GapProblem):
 
 
 class FlightProblem(FreeBodyModel, WindowedProblem):
-    """One body that flies, bounces, slides or rolls on what is fixed."""
+    """Free bodies that fly, bounce, slide or roll on what is fixed, or collide."""
 
     plan = SearchPlan(
         jumps=True,  # Where an object's spheres land in another order.
@@ -168,15 +168,19 @@ class RolloutProblem(WindowModel, WindowedProblem):
 def point_on_face_of(model: FreeBodyModel) -> list[Finding]:
     """A warning where a body that has faces touches something: Drake gives it one
     point there, and here it stands on spheres."""
-    if not model.has_faces or not len(touched(model)):
-        return []
-    grounds = sorted(at.split("~")[1] for at in model.dynamics.places(STIFFNESS))
-    return [
-        one_point(
-            model.name, f"{model.name} on {', '.join(grounds)}", model.on_side,
-            model.recordings[0].name,
-        )
-    ]  # fmt: skip
+    found = []
+    for name in model.with_faces:
+        if not len(touched(model, name)):
+            continue
+        places = [at.split("~") for at in model.dynamics.places(STIFFNESS)]
+        grounds = sorted(b for a, b in places if a == name and b not in model.bodies)
+        found.append(
+            one_point(
+                name, f"{name} on {', '.join(grounds)}", name in model.on_side,
+                model.recordings[0].name,
+            )
+        )  # fmt: skip
+    return found
 
 
 def unexplained_in_windows(

@@ -31,12 +31,42 @@ REST_DEPTH = 2e-5  # [m] Of a body on a face that is not stiffer than it need be
 AT_CORNERS = 0.4  # Of a face's load; it is 0.16 (a disc's rim: 0.33) if pressed evenly.
 # Forces that have their own numbers here; what changes shapes, inertias and surfaces is
 # read off the plant.
-_FORCES = ("constant_force", "sinusoidal_force", "body_drag", "rolling_resistance",
+FORCES = ("constant_force", "sinusoidal_force", "body_drag", "rolling_resistance",
            DAMPER)  # fmt: skip
-_SENSORS = ("length_scale", "sensor_delay", "sensor_bias", "clock_skew")
+SURFACES = ("contact_friction", "contact_stiffness", "contact_dissipation")
+SENSORS = ("length_scale", "sensor_delay", "sensor_bias", "clock_skew")
 _PLANT = ("object_size", "corner_radius", "object_mass", "object_com", "object_inertia",
           "contact_friction", "contact_stiffness", "contact_dissipation",
           "friction_patch", "plane_height", "plane_tilt", "gravity_tilt")  # fmt: skip
+
+
+def load_free_bodies(scene: Scene) -> tuple[LoadedScene, list[RigidBody]]:
+    """The scene, and its free bodies.
+
+    Raises: DoesNotFit where anything else moves, or contact is not that of points.
+    """
+    for effect in scene.effects:
+        if effect.kind not in (*FORCES, "length_scale", *_PLANT):
+            raise DoesNotFit(f"effect {effect.kind} is not one of a free body")
+    if scene.friction_zones or scene.plant.contact_model != "point":
+        raise DoesNotFit("friction zones and hydroelastic contact are Drake's alone")
+    loaded = load_scene(scene, DiagramBuilder())
+    plant = loaded.plant
+    bodies = [plant.get_body(i) for i in sorted(plant.GetFloatingBaseBodies())]
+    if not bodies or plant.num_velocities() != 6 * len(bodies):
+        raise DoesNotFit("expected free bodies and nothing else that moves")
+    return loaded, bodies
+
+
+def in_order(effects: Sequence[Effect]) -> list[Effect]:
+    """Those that change a body, as they are applied.
+
+    Raises: ValueError for parameters that no effect of the kind can have.
+    """
+    for effect in effects:
+        check_parameters(effect, KINDS[effect.kind])
+    ranked = sorted(effects, key=lambda e: KINDS[e.kind].rank)
+    return [effect for effect in ranked if effect.kind in CHANGES]
 
 
 class FreeBodyScene:
@@ -46,28 +76,27 @@ class FreeBodyScene:
     A box, a cylinder or a hull of the body touches with spheres at its corners and
     within its faces (face_supports.py), as an area would and Drake's point does not.
 
-    Args: on_side: whether a cylinder of it lies on its side.
+    Args: on_side: whether a cylinder of it lies on its side. of: the loaded scene, and
+        which of its free bodies, if there are several.
     Raises: DoesNotFit where the scene has anything else that moves, shapes that have no
         such spheres, anything fixed but boxes and half-spaces, or effects of other
         kinds.
     """
 
-    def __init__(self, scene: Scene, on_side: bool = False):
+    def __init__(
+        self,
+        scene: Scene,
+        on_side: bool = False,
+        of: tuple[LoadedScene, RigidBody] | None = None,
+    ):
         self.scene, self._on_side, self._eased = scene, on_side, 1.0
-        for effect in scene.effects:
-            if effect.kind not in (*_FORCES, "length_scale", *_PLANT):
-                raise DoesNotFit(f"effect {effect.kind} is not one of a free body")
-        if scene.friction_zones or scene.plant.contact_model != "point":
-            raise DoesNotFit(
-                "friction zones and hydroelastic contact are Drake's alone"
-            )
-        loaded = load_scene(scene, DiagramBuilder())
-        plant = loaded.plant
-        bodies = [plant.get_body(i) for i in sorted(plant.GetFloatingBaseBodies())]
-        if len(bodies) != 1 or plant.num_velocities() != 6:
-            raise DoesNotFit("expected one free body and nothing else that moves")
-        self.name = full_name(plant, bodies[0])
-        self._read(loaded, bodies[0])
+        if of is None:
+            loaded, bodies = load_free_bodies(scene)
+            if len(bodies) != 1:
+                raise DoesNotFit("expected one free body and nothing else that moves")
+            of = loaded, bodies[0]
+        self.name = full_name(of[0].plant, of[1])
+        self._read(*of)
 
     @property
     def has_faces(self) -> bool:
@@ -89,23 +118,34 @@ class FreeBodyScene:
         Args: at_corners: share of a face's load that its corners carry.
         Raises: ValueError for effects that no body can have.
         """
-        if not all(e.kind in _CHANGES or e.kind in _SENSORS for e in effects):
+        if not all(e.kind in CHANGES or e.kind in SENSORS for e in effects):
             more = replace(self.scene, effects=[*self.scene.effects, *effects])
             other = FreeBodyScene(more, self._on_side)
             other._eased = self._eased
             return other.body((), at_corners)
-        now = _Numbers(**{k: np.array(v) for k, v in vars(self._numbers).items()})
-        for effect in sorted(effects, key=lambda e: KINDS[e.kind].rank):
-            check_parameters(effect, KINDS[effect.kind])
-            change = _CHANGES.get(effect.kind)
-            if change is None:
-                continue
-            at = [place.strip() for each in effect.at for place in each.split("~")]
-            at = [self._whole_name.get(place, place) for place in at]
-            mine = np.array([ground in at for ground in self._grounds], bool)
-            if self.name in at or mine.any():
-                change(now, effect.parameters, mine)
-        pairs = _pairs(now, self._guess) * self._touch[:, :, None]
+        now = self.numbers()
+        for effect in in_order(effects):
+            places = self.places(effect)
+            on = self.grounds_in(places)
+            if self.name in places or on.any():
+                CHANGES[effect.kind](now, effect.parameters, on)
+        return self.body_of(now, at_corners)
+
+    def numbers(self) -> "Numbers":
+        """A copy of the scene's own."""
+        return Numbers(**{k: np.array(v) for k, v in vars(self._numbers).items()})
+
+    def places(self, effect: Effect) -> list[str]:
+        """Full names of the bodies that it is at."""
+        at = [place.strip() for each in effect.at for place in each.split("~")]
+        return [self._whole_name.get(place, place) for place in at]
+
+    def grounds_in(self, places: Sequence[str]) -> np.ndarray:
+        """(m,) which of the fixed shapes are of these bodies."""
+        return np.array([ground in places for ground in self._grounds], bool)
+
+    def body_of(self, now: "Numbers", at_corners: float = AT_CORNERS) -> FreeBody:
+        pairs = _pairs(now, self._drake) * self._touch[:, :, None]
         # Spring and damper of what stands within a face, whose corners have the pair's.
         inner = now.role == WITHIN
         pairs[inner, :, 0] *= now.inner * (1.0 / at_corners - 1.0)
@@ -173,12 +213,12 @@ class FreeBodyScene:
         about = M.CalcRotationalInertia().CopyToFullMatrix3()
         central = about - mass * (com @ com * np.eye(3) - np.outer(com, com))
         self._gravity = np.array(plant.gravity_field().gravity_vector())
-        self._guess = default_stiffness(plant)
+        self._drake = drakes(plant)
         self._touch = np.array(
             [[not inspector.CollisionFiltered(a, b) for b in others] for a in mine],
             float,
         ).reshape(len(mine), len(others))[of]
-        self._numbers = _Numbers(
+        self._numbers = Numbers(
             np.array(mass), com, central, np.array(spheres),
             np.array(fixed).reshape(-1, 15), np.array(origins).reshape(-1, 3),
             np.array([_surface(inspector, g) for g in mine])[of],
@@ -187,16 +227,16 @@ class FreeBodyScene:
             np.full(len(others), np.nan), np.array(role), np.array(inner),
         )  # fmt: skip
         for effect in loaded.effects:
-            if effect.kind in _FORCES:
+            if effect.kind in FORCES:
                 at = [p.strip() for each in effect.at for p in each.split("~")]
                 at = [self._whole_name.get(place, place) for place in at]
                 on = np.array([ground in at for ground in self._grounds], bool)
                 if self.name in at:
-                    _CHANGES[effect.kind](self._numbers, effect.parameters, on)
+                    CHANGES[effect.kind](self._numbers, effect.parameters, on)
 
 
 @dataclass(eq=False)
-class _Numbers:
+class Numbers:
     """What effects change. own (n, 4), other (m, 4): stiffness (inf: Drake's guess),
     dissipation, static and dynamic friction of each surface; rolling (m,); damper (m,):
     in the place of the dissipation, NaN where there is none; role (n,) of each sphere;
@@ -229,33 +269,61 @@ def _surface(inspector, geometry) -> list[float]:
     return [k, d, mu.static_friction(), mu.dynamic_friction()]
 
 
-def _pairs(now: _Numbers, guess: float) -> np.ndarray:
-    """(n, m, 6) as Drake combines two surfaces."""
-    own, other = now.own[:, None], now.other[None, :]
-    k1 = np.where(np.isfinite(own[..., 0]), own[..., 0], guess)
-    k2 = np.where(np.isfinite(other[..., 0]), other[..., 0], guess)
+@dataclass(frozen=True)
+class Drakes:
+    """What Drake adds to two surfaces. stiffness: of one that has none [N/m]: at twice
+    it in each of two, the heaviest body would rest a millimetre deep. is_middle:
+    whether the contact point is midway between them, as a continuous plant has it;
+    else it lies as springs in series would."""
+
+    stiffness: float
+    is_middle: bool
+
+
+def drakes(plant: MultibodyPlant) -> Drakes:
+    heaviest = max(
+        plant.get_body(BodyIndex(i)).default_mass()
+        for i in range(1, plant.num_bodies())
+    )
+    g = float(np.linalg.norm(plant.gravity_field().gravity_vector()))
+    return Drakes(2.0 * heaviest * g / 1e-3, plant.time_step() == 0.0)
+
+
+def _pairs(now: Numbers, drake: Drakes) -> np.ndarray:
+    """(n, m, 6) of spheres and what is fixed."""
+    return combined(now.own[:, None], now.other[None, :], now.damper, drake)
+
+
+def combined(own, other, damper, drake: Drakes) -> np.ndarray:
+    """(..., 6) numbers of a contact, as Drake combines two surfaces (..., 4).
+
+    Args: damper: that stands in for the dissipation, NaN where there is none.
+    """
+    k1 = np.where(np.isfinite(own[..., 0]), own[..., 0], drake.stiffness)
+    k2 = np.where(np.isfinite(other[..., 0]), other[..., 0], drake.stiffness)
     mu = [
         2.0 * own[..., i] * other[..., i]
         / np.maximum(own[..., i] + other[..., i], 1e-300)
         for i in (2, 3)
     ]  # fmt: skip
     d = (k2 * own[..., 1] + k1 * other[..., 1]) / (k1 + k2)
-    d = np.where(np.isfinite(now.damper), 0.0, d)
-    damper = np.broadcast_to(np.nan_to_num(now.damper), d.shape)
-    return np.stack([k1 * k2 / (k1 + k2), d, *mu, k1 / (k1 + k2), damper], axis=-1)
+    d = np.where(np.isfinite(damper), 0.0, d)
+    damper = np.broadcast_to(np.nan_to_num(damper), d.shape)
+    share = np.full(d.shape, 0.5) if drake.is_middle else k1 / (k1 + k2)
+    return np.stack([k1 * k2 / (k1 + k2), d, *mu, share, damper], axis=-1)
 
 
 # ----- Effects: the same as in models/effects, on these numbers.
 
 
-def _size(now: _Numbers, p, on) -> None:
+def _size(now: Numbers, p, on) -> None:
     scale = p["scale"] if "scale" in p else p["radius"] / now.spheres[0, 3]
     now.spheres *= scale
     now.com *= scale
     now.inertia *= scale**2
 
 
-def _corners(now: _Numbers, p, on) -> None:
+def _corners(now: Numbers, p, on) -> None:
     if (now.role == CORNER).sum() == 8:  # A box becomes spheres, which have no faces.
         now.spheres[now.role == WITHIN] = now.spheres[now.role == CORNER][0]
         now.inner[...] = 0.0
@@ -272,17 +340,17 @@ def _corners(now: _Numbers, p, on) -> None:
     now.spheres[corners, 3] = p["radius"]
 
 
-def _mass(now: _Numbers, p, on) -> None:
+def _mass(now: Numbers, p, on) -> None:
     now.inertia *= p["mass"] / now.mass
     now.mass[...] = p["mass"]
 
 
-def _com(now: _Numbers, p, on) -> None:
+def _com(now: Numbers, p, on) -> None:
     for i, a in enumerate("xyz"):
         now.com[i] = p.get(a, now.com[i])
 
 
-def _moments(now: _Numbers, p, on) -> None:
+def _moments(now: Numbers, p, on) -> None:
     for i, a in enumerate(("ixx", "iyy", "izz")):
         now.inertia[i, i] = p.get(a, now.inertia[i, i])
     w = np.linalg.eigvalsh(now.inertia)
@@ -290,7 +358,7 @@ def _moments(now: _Numbers, p, on) -> None:
         raise ValueError(f"object_inertia: no body has {p}")
 
 
-def _friction(now: _Numbers, p, on) -> None:
+def _friction(now: Numbers, p, on) -> None:
     mu, own = p["friction"], now.own[0, 3]
     if 2.0 * own > mu or mu == 0.0:
         now.other[on, 2:] = mu * own / (2.0 * own - mu) if mu > 0.0 else 0.0
@@ -298,7 +366,7 @@ def _friction(now: _Numbers, p, on) -> None:
         now.own[:, 2:] = now.other[on, 2:] = mu
 
 
-def _stiffness(now: _Numbers, p, on) -> None:
+def _stiffness(now: Numbers, p, on) -> None:
     k, k1, k2 = p["stiffness"], now.other[on, 0][0], now.own[0, 0]
     if np.isfinite([k1, k2]).all():
         scale = k * (k1 + k2) / (k1 * k2)
@@ -308,7 +376,7 @@ def _stiffness(now: _Numbers, p, on) -> None:
         now.own[:, 0] = now.other[on, 0] = 2.0 * k
 
 
-def _dissipation(now: _Numbers, p, on) -> None:
+def _dissipation(now: Numbers, p, on) -> None:
     d, (k2, d2) = p["dissipation"], now.own[0, :2]
     k1 = now.other[on, 0][0]
     d1 = -1.0
@@ -319,35 +387,35 @@ def _dissipation(now: _Numbers, p, on) -> None:
     now.other[on, 1] = d1
 
 
-def _damper(now: _Numbers, p, on) -> None:
+def _damper(now: Numbers, p, on) -> None:
     now.damper[on] = p["damping"]
 
 
-def _height(now: _Numbers, p, on) -> None:
+def _height(now: Numbers, p, on) -> None:
     now.fixed[on, 11] += p["height"]
 
 
-def _tilt(now: _Numbers, p, on) -> None:
+def _tilt(now: Numbers, p, on) -> None:
     R = RollPitchYaw(p["roll"], p["pitch"], 0.0).ToRotationMatrix().matrix()
     for m in np.flatnonzero(on):
         now.fixed[m, :9] = (R @ now.fixed[m, :9].reshape(3, 3)).ravel()
         now.fixed[m, 9:12] = now.origins[m] + R @ (now.fixed[m, 9:12] - now.origins[m])
 
 
-def _rolling(now: _Numbers, p, on) -> None:
+def _rolling(now: Numbers, p, on) -> None:
     now.rolling[on] += p["coefficient"]
 
 
-def _force(now: _Numbers, p, on) -> None:
+def _force(now: Numbers, p, on) -> None:
     wave = [p.get("frequency", 0.0), p.get("phase", 0.0), 0.0]
     now.forces = np.vstack([now.forces, [p["fx"], p["fy"], p["fz"], *wave]])
 
 
-def _drag(now: _Numbers, p, on) -> None:
+def _drag(now: Numbers, p, on) -> None:
     now.drag += [p["linear"], p["angular"]]
 
 
-def _patch(now: _Numbers, p, on) -> None:
+def _patch(now: Numbers, p, on) -> None:
     if not (p["x_min"] < p["x_max"] and p["y_min"] < p["y_max"]):
         raise ValueError(f"friction_patch: the patch is empty: {p}")
     sides = [p[k] for k in ("x_min", "x_max", "y_min", "y_max")]
@@ -355,7 +423,7 @@ def _patch(now: _Numbers, p, on) -> None:
     now.patches = np.vstack([now.patches, *more])
 
 
-_CHANGES = {
+CHANGES = {
     "friction_patch": _patch,
     "object_size": _size, "corner_radius": _corners, "object_mass": _mass,
     "object_com": _com, "object_inertia": _moments, "contact_friction": _friction,
@@ -364,14 +432,3 @@ _CHANGES = {
     "constant_force": _force, "sinusoidal_force": _force, "body_drag": _drag,
     DAMPER: _damper,
 }  # fmt: skip
-
-
-def default_stiffness(plant: MultibodyPlant) -> float:
-    """What Drake gives shapes that have none [N/m]: at twice it in each of two, the
-    heaviest body would rest a millimetre deep."""
-    heaviest = max(
-        plant.get_body(BodyIndex(i)).default_mass()
-        for i in range(1, plant.num_bodies())
-    )
-    g = float(np.linalg.norm(plant.gravity_field().gravity_vector()))
-    return 2.0 * heaviest * g / 1e-3

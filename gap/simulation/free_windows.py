@@ -1,4 +1,4 @@
-"""Windows of one free body that flies, bounces, slides or rolls on what is fixed.
+"""Windows of free bodies that fly, bounce, slide or roll on what is fixed, and collide.
 
 A window starts from a state smoothed on one side of an impact, never across it, at the
 row from which the next impact is told best. It ends 0.1 s after that impact: beyond the
@@ -6,6 +6,7 @@ second one all is chaos. How an uncertain start grows through the contact is sim
 and counts as noise.
 """
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -13,11 +14,20 @@ import numpy as np
 
 from makebreak.gap.data.recording import Episode, Recording
 from makebreak.gap.does_not_fit import DoesNotFit
-from makebreak.gap.numerics.free_body import FreeBody, lowest_gap, placed, simulate
+from makebreak.gap.numerics.free_body import (
+    FreeBodies,
+    FreeBody,
+    lowest_gap,
+    nearest,
+    placed,
+    simulate_all,
+)
 from makebreak.gap.numerics.free_flight import fit_flight, turned_by
 from makebreak.gap.numerics.runs import runs_of
 from makebreak.gap.numerics.struck import struck_rows
+from makebreak.gap.simulation.free_bodies import FreeBodiesScene
 from makebreak.gap.simulation.free_body import FreeBodyScene
+from makebreak.gap.simulation.unseen_spin import TOUCHES, Rolling, rolling
 from makebreak.gap.simulation.windows import TURN, WindowedResidual, spin_of
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect
@@ -50,8 +60,9 @@ _STATE = (*TURN, *_PLACE, "wx", "wy", "wz", "vx", "vy", "vz")
 
 @dataclass(frozen=True, eq=False)
 class FreeWindow:
-    """state (7, 3): orientation and place with two derivatives; spread (7, 2, 2): the
-    covariances of the first two. std (n, n_channels) of measured minus simulated."""
+    """state (7 n_bodies, 3): orientation and place with two derivatives, of one body
+    after the other; spread (7 n_bodies, 2, 2): the covariances of the first two. std
+    (n, n_channels) of measured minus simulated."""
 
     recording: int
     episode: int
@@ -63,13 +74,16 @@ class FreeWindow:
     block: int
     train: bool  # Every third block is held out.
     after_hits: int  # Impacts of the episode before it.
+    # Of each body whose orientation is not measured, as it rolls or slides.
+    rolling: tuple[Rolling | None, ...] = ()
 
 
 class FreeBodyModel(WindowedResidual):
-    """Residuals of windows of one free body, as InverseModel gives those of mechanisms.
+    """Residuals of windows of free bodies, as InverseModel gives those of mechanisms.
 
-    Raises: DoesNotFit where scene or recordings hold anything else (FreeBodyScene); the
-        body's x, y and z must be measured.
+    Raises: DoesNotFit where scene or recordings hold anything else (FreeBodiesScene),
+        or bodies with faces come near one another; the bodies' x, y and z must be
+        measured.
     """
 
     def __init__(
@@ -80,32 +94,42 @@ class FreeBodyModel(WindowedResidual):
         most: int = 48,
     ):
         self.scene, self.recordings = scene, list(recordings)
-        self._numbers = FreeBodyScene(scene)
-        self.on_side = lies_on_side(self._numbers, recordings)
-        if self.on_side:
-            self._numbers = FreeBodyScene(scene, on_side=True)
-        self.has_faces = self._numbers.has_faces
-        self.name, self._body = self._numbers.name, self._numbers.body()
-        self.bodies, self.joints = [self.name], list[str]()
-        self.dynamics = SceneDynamics(scene)
-        if not all(f"{self.name}.{a}" in r for a in _PLACE for r in recordings):
-            raise DoesNotFit(f"expected x, y and z of {self.name} in all recordings")
-        self._turns = all(f"{self.name}.{a}" in r for a in TURN for r in recordings)
-        if not self._turns and (len(self._body.spheres) > 1 or self._body.com.any()):
-            raise DoesNotFit(f"expected the orientation of {self.name}")
-        if self.has_faces:
-            _check_edges(self._body, self.name, recordings)
-        self.channels = [
-            c for a in _STATE if all((c := f"{self.name}.{a}") in r for r in recordings)
+        self._numbers = FreeBodiesScene(scene)
+        self.on_side = [
+            one.name for one in self._numbers.each if lies_on_side(one, recordings)
         ]
+        if self.on_side:
+            self._numbers = FreeBodiesScene(scene, self.on_side)
+        self.with_faces = [one.name for one in self._numbers.each if one.has_faces]
+        self._bodies = self._numbers.bodies()
+        self.bodies, self.joints = self._numbers.names, list[str]()
+        self.dynamics = SceneDynamics(scene)
+        self._turns = []  # Whether the orientation of a body is measured.
+        for name, body in zip(self.bodies, self._bodies.each, strict=True):
+            if not all(f"{name}.{a}" in r for a in _PLACE for r in recordings):
+                raise DoesNotFit(f"expected x, y and z of {name} in all recordings")
+            turns = all(f"{name}.{a}" in r for a in TURN for r in recordings)
+            if not turns and (len(body.spheres) > 1 or body.com.any()):
+                raise DoesNotFit(f"expected the orientation of {name}")
+            if name in self.with_faces:
+                _check_edges(body, name, recordings)
+            self._turns.append(turns)
+        self._check_apart()
+        self.channels, sizes = list[str](), []
+        for name, body in zip(self.bodies, self._bodies.each, strict=True):
+            own = [f"{name}.{a}" for a in _STATE]
+            own = [c for c in own if all(c in r for r in recordings)]
+            self.channels += own
+            sizes += [_size(body)] * len(own)
         self.noise = np.array(
             [max(r.channels[c].noise for r in recordings) for c in self.channels]
         )
         self.noise = np.maximum(self.noise, 1e-9)
-        reach = np.linalg.norm(self._body.spheres[:, :3], axis=1)
-        size = float((reach + self._body.spheres[:, 3]).max())
+        self._sizes = np.array(sizes)
         # Errors beyond the body's size, or a radian, say no more than these.
-        self._cap = np.array([self._most(c, size) for c in self.channels])
+        self._cap = np.array(
+            [self._most(c, x) for c, x in zip(self.channels, sizes, strict=True)]
+        )
         # What recordings say of their sensors.
         self._filters: list[dict[str, tuple[Stage, ...]]] = [
             {c: stages for c in self.channels if (stages := r.channels[c].stages)}
@@ -117,9 +141,9 @@ class FreeBodyModel(WindowedResidual):
         self._curvatures: list[float] = []
         self._falls_freely = True
         self._cut_all()
-        if self.has_faces and not self._is_struck:
+        if self.with_faces and not self._is_struck:
             self._numbers.ease()
-            self._body = self._numbers.body()
+            self._bodies = self._numbers.bodies()
         if _is_beyond_chance(self._curvatures):
             # Drag, say: a start fitted by gravity alone would be wrong, and the effect
             # that is looked for would make it worse.
@@ -133,7 +157,8 @@ class FreeBodyModel(WindowedResidual):
             self.windows = [self.windows[k] for k in sorted(order[:most])]
         if not self.windows:
             raise DoesNotFit(
-                f"no episode holds {FEWEST_ROWS} samples of {self.name} between impacts"
+                f"no episode holds {FEWEST_ROWS} samples of "
+                f"{' and '.join(self.bodies)} between impacts"
             )
         self._seen = [self._measured(w) for w in self.windows]
         self._add_spread()
@@ -150,16 +175,32 @@ class FreeBodyModel(WindowedResidual):
             return size
         return 0.5 if what in TURN else (20.0 * size if what[0] == "v" else 20.0)
 
-    @property
-    def body(self) -> FreeBody:
-        """The scene's, without further effects."""
-        return self._body
+    def body(self, at: str) -> FreeBody:
+        """The scene's, without further effects, that `at` (a body or a pair) names."""
+        return self._bodies.each[self.bodies.index(first_of(self, at))]
+
+    def _check_apart(self) -> None:
+        """Raises: DoesNotFit where two bodies come near each other that would touch
+        with spheres which stand in for faces."""
+        for (i, a), (j, b) in itertools.combinations(enumerate(self.bodies), 2):
+            if not {a, b} & {*self.with_faces} or not self._numbers.meet(a, b):
+                continue
+            reach = _size(self._bodies.each[i]) + _size(self._bodies.each[j]) + NEAR
+            for recording in self.recordings:
+                one, other = (
+                    np.stack([recording[f"{n}.{c}"] for c in _PLACE], 1) for n in (a, b)
+                )
+                if np.nanmin(np.linalg.norm(one - other, axis=1), initial=9e9) < reach:
+                    raise DoesNotFit(f"{a} and {b} come near each other")
 
     # ----- Cutting
 
     def _signals(self) -> list[str]:
-        turns = TURN if self._turns else ()
-        return [f"{self.name}.{a}" for a in (*turns, *_PLACE)]
+        return [
+            f"{name}.{a}"
+            for name, turns in zip(self.bodies, self._turns, strict=True)
+            for a in ((*TURN, *_PLACE) if turns else _PLACE)
+        ]
 
     def _cut_all(self) -> None:
         self.windows: list[FreeWindow] = []
@@ -177,8 +218,9 @@ class FreeBodyModel(WindowedResidual):
         if any(np.isfinite(y).sum() < FEWEST_ROWS for y in values.values()):
             return
         rough = np.zeros(len(time), bool)
-        for axis in _PLACE:
-            c = f"{self.name}.{axis}"
+        for c in values:
+            if c.rsplit(".", 1)[-1] not in _PLACE:
+                continue
             stages = recording.channels[c].stages or ()
             noise = recording.channels[c].noise
             rough |= struck_rows(
@@ -206,16 +248,21 @@ class FreeBodyModel(WindowedResidual):
         if rows < (FEWEST_IN_FLIGHT if may_fly else FEWEST_ROWS):
             return
         n = b - a
-        states = np.zeros((n, 7, 3))
-        spreads = np.zeros((n, 7, 2, 2))
-        states[:, 0, 0] = 1.0
-        for k, name in enumerate((*TURN, *_PLACE)):
-            c = f"{self.name}.{name}"
+        many = len(self.bodies)
+        states = np.zeros((n, 7 * many, 3))
+        spreads = np.zeros((n, 7 * many, 2, 2))
+        deviation = np.zeros((n, 2, 7 * many))  # Of rate and acceleration.
+        names = [f"{x}.{a}" for x in self.bodies for a in (*TURN, *_PLACE)]
+        for k, c in enumerate(names):
+            if k % 7 == 0:
+                states[:, k, 0] = 1.0
             if c in values:
                 stages = recording.channels[c].stages or ()
                 noise = recording.channels[c].noise
                 s = smooth_filtered(time[a:b], values[c][a:b], noise, stages)
                 states[:, k], spreads[:, k] = s.x, s.P[:, :2, :2]
+                square = np.diagonal(s.P, axis1=1, axis2=2)[:, 1:3]
+                deviation[:, :, k] = np.sqrt(np.maximum(square, 0.0))
                 # Where the acceleration jumps (it comes to rest, say) a smoothed state
                 # is wrong by more than it knows.
                 row, beside = np.arange(n), 4
@@ -224,7 +271,19 @@ class FreeBodyModel(WindowedResidual):
                 reach = beside * float(np.median(np.diff(time[a:b])))
                 spreads[:, k, 1, 1] += (0.25 * jump * reach) ** 2
                 spreads[:, k, 0, 0] += (0.06 * jump * reach**2) ** 2
-        flies = may_fly and self._fly(recording, time[a:b], values, a, states, spreads)
+        of = [slice(7 * k, 7 * k + 7) for k in range(many)]
+        flights = []
+        for k, o in enumerate(of if may_fly else ()):
+            path = states[:, o], spreads[:, o]
+            flights.append(self._fly(k, recording, time[a:b], values, a, *path))
+        flies = may_fly and all(flights)
+        rolls: list[Sequence[Rolling | None]] = []
+        for k, (o, body) in enumerate(zip(of, self._bodies.each, strict=True)):
+            each: Sequence[Rolling | None] = [None] * n
+            if not self._turns[k]:
+                place = states[:, o][:, 4:]
+                each = rolling(body, time[a:b], place, deviation[:, :, o][:, :, 4:])
+            rolls.append(each)
         if rows < FEWEST_ROWS and not flies:
             return
         spans = []
@@ -241,7 +300,7 @@ class FreeBodyModel(WindowedResidual):
                 spans.append((k, max(late, k + 1), time[end - 1], end))
         for k0, k1, aim, end in spans:
             tau = aim - time[k0:k1]
-            P = spreads[k0 - a : k1 - a, 4:]
+            P = spreads[k0 - a : k1 - a, np.arange(7 * many) % 7 >= 4]
             wide = np.sum(
                 P[:, :, 0, 0]
                 + 2 * tau[:, None] * P[:, :, 0, 1]
@@ -262,23 +321,26 @@ class FreeBodyModel(WindowedResidual):
                     i, episode.number, float(time[k]),
                     slice(episode.first + k, episode.first + end), states[k - a],
                     spreads[k - a], np.zeros(0), block, block % 3 != 1, before,
+                    tuple(each[k - a] for each in rolls),
                 )
             )  # fmt: skip
 
-    def _fly(self, recording, time, values, first: int, states, spreads) -> bool:
-        """Where nothing is touched before an impact, the states (n, 7, 3) and their
+    def _fly(self, number, recording, time, values, first, states, spreads) -> bool:
+        """Where a body touches nothing before an impact, the states (n, 7, 3) and their
         covariances (n, 7, 2, 2) that all poses of the flight together tell. Returns:
-        whether they are of a flight."""
-        signals = [f"{self.name}.{a}" for a in (*TURN, *_PLACE)]
+        whether they are of a flight. Args: number: of the body."""
+        name, body = self.bodies[number], self._bodies.each[number]
+        turns = self._turns[number]
+        signals = [f"{name}.{a}" for a in (*TURN, *_PLACE)]
         n = len(time)
         pose, noise = np.full((n, 7), np.nan), np.ones(7)
         for k, c in enumerate(signals):
             if c in values:
                 pose[:, k] = values[c][first : first + n]
                 noise[k] = recording.channels[c].noise
-        if not self._turns:
+        if not turns:
             pose[:, :4] = [1.0, 0.0, 0.0, 0.0]
-        at = [lowest_gap(self._body, x) for x in pose[np.isfinite(pose).all(axis=1)]]
+        at = [lowest_gap(body, x) for x in pose[np.isfinite(pose).all(axis=1)]]
         if np.mean(np.array(at) < NEAR) > 0.5:  # It slides or rolls.
             return False
         q, dq = states[n // 2, :4, 0], states[n // 2, :4, 1]
@@ -287,11 +349,11 @@ class FreeBodyModel(WindowedResidual):
             [states[0, :4, 0], states[0, 4:, 0], spin_of(q, dq - q * (q @ dq)),
              states[n // 2, 4:, 1]]
         )  # fmt: skip
-        guess[12] -= self._body.gravity[2] * (time[n // 2] - time[0])
-        flight = fit_flight(self._body, time, pose, noise, guess)
+        guess[12] -= body.gravity[2] * (time[n // 2] - time[0])
+        flight = fit_flight(body, time, pose, noise, guess)
         if flight is None or flight.rms > FLIES:
             return False
-        path, covariance = flight.path(self._body, time - time[0])
+        path, covariance = flight.path(body, time - time[0])
         if not np.isfinite(path).all() or not np.isfinite(covariance).all():
             return False
         covariance *= max(flight.rms, 1.0) ** 2
@@ -301,11 +363,11 @@ class FreeBodyModel(WindowedResidual):
         )
         for k, (x, C) in enumerate(zip(path, covariance, strict=True)):
             if self._falls_freely:
-                states[k, 4:] = np.stack([x[4:7], x[10:], self._body.gravity], axis=1)
+                states[k, 4:] = np.stack([x[4:7], x[10:], body.gravity], axis=1)
                 for i in range(3):
                     of = np.ix_([3 + i, 9 + i], [3 + i, 9 + i])
                     spreads[k, 4 + i] = C[of]
-            if self._turns:
+            if turns:
                 x[:4] *= np.sign(x[:4] @ states[k, :4, 0])
                 states[k, :4, 0], states[k, :4, 1] = x[:4], turned_by(x[:4], x[7:10])
                 G = np.stack([turned_by(x[:4], e) for e in np.eye(3)], axis=1)
@@ -323,7 +385,8 @@ class FreeBodyModel(WindowedResidual):
     def _add_spread(self) -> None:
         """Noise, and what uncertain starts do in the scene as it is."""
         rng = np.random.default_rng(0)
-        plain = [self._simulate(self._body, w, w.state, 1.0) for w in self.windows]
+        whole = np.ones(len(self.bodies))
+        plain = [self._simulate(self._bodies, w, w.state, whole) for w in self.windows]
         stds = []
         for w, y in zip(self.windows, plain, strict=True):
             wide = np.zeros_like(y)
@@ -332,11 +395,12 @@ class FreeBodyModel(WindowedResidual):
                 state = np.array(w.state)
                 for k, L in enumerate(roots):
                     state[k, :2] += L @ rng.normal(size=2)
-                unseen = None if self._turns else self._unseen_spin(w, rng)
-                body = self._body
-                if self.has_faces:  # Nobody knows where a face presses.
-                    body = self._numbers.body((), rng.uniform(*AT_CORNERS_BETWEEN))
-                off = self._simulate(body, w, state, 1.0, unseen) - y
+                unseen = self._unseen_spins(w, rng)
+                bodies = self._bodies
+                if self.with_faces:  # Nobody knows where a face presses.
+                    at_corners = rng.uniform(*AT_CORNERS_BETWEEN)
+                    bodies = self._numbers.bodies((), at_corners)
+                off = self._simulate(bodies, w, state, whole, unseen) - y
                 off[~np.isfinite(off)] = 1e3
                 wide += np.minimum(off**2, self._cap**2) / DRAWS
             stds.append(np.sqrt(self.noise**2 + wide))
@@ -344,18 +408,28 @@ class FreeBodyModel(WindowedResidual):
         off = np.concatenate(self.errors_over(plain, ones))
         # A gap is not measured to better than a share of itself.
         place = [k for k, c in enumerate(self.channels) if c[-2:] in (".x", ".y", ".z")]
-        least = BLUR * float(np.sqrt(np.mean(np.sum(off[:, place] ** 2, axis=1))))
-        floor = least * self._cap / self._cap[place[0]]
+        square = np.sum(off[:, place] ** 2, axis=1) / len(self.bodies)
+        floor = BLUR * float(np.sqrt(np.mean(square))) * self._cap / self._sizes
         self.windows = [
             replace(w, std=np.sqrt(std**2 + floor**2))
             for w, std in zip(self.windows, stds, strict=True)
         ]
 
-    def _unseen_spin(self, w: FreeWindow, rng: np.random.Generator) -> np.ndarray:
-        """(3,) [rad/s] as a ball may have whose orientation is not measured: about as
-        fast as one that rolls. What friction makes of it in a bounce, nobody knows."""
-        speed = float(np.linalg.norm(w.state[4:, 1]))
-        return speed / self._body.spheres[0, 3] * rng.normal(size=3)
+    def _unseen_spins(self, w: FreeWindow, rng: np.random.Generator):
+        """Of each body, (3,) as a ball may spin [rad/s] while it flies, and how it may
+        roll or slide; None where its orientation is measured.
+
+        In flight it spins about as fast as one that rolls. What friction makes of it in
+        a bounce, nobody knows."""
+        found: list[tuple[np.ndarray, Rolling] | None] = []
+        for k, rolls in enumerate(w.rolling):
+            if rolls is None:
+                found.append(None)
+                continue
+            speed = float(np.linalg.norm(w.state[7 * k + 4 : 7 * k + 7, 1]))
+            spin = speed / self._bodies.each[k].spheres[0, 3] * rng.normal(size=3)
+            found.append((spin, rolls.drawn(rng)))
+        return found
 
     def _share_out(self) -> None:
         """Other blocks are held out if those that are hold next to nothing of the gap:
@@ -379,46 +453,52 @@ class FreeBodyModel(WindowedResidual):
     # ----- Simulating
 
     def _simulate(
-        self, body: FreeBody, w: FreeWindow, state, length: float,
-        unseen: np.ndarray | None = None,
-    ) -> np.ndarray:  # fmt: skip
-        """(n, n_channels) of a window. unseen: spin of a ball in flight."""
-        q = state[:4, 0] / np.linalg.norm(state[:4, 0])
-        dq = state[:4, 1] - q * (q @ state[:4, 1])
-        place, velocity = state[4:, 0] / length, state[4:, 1] / length
-        spin = spin_of(q, dq)
-        if not self._turns:
-            radius = body.spheres[0, 3]
-            if lowest_gap(body, np.concatenate([q, place])) < 0.03 * radius:
-                spin = np.array([-velocity[1], velocity[0], 0.0]) / radius
-            elif unseen is not None:
-                spin = unseen
+        self, bodies: FreeBodies, w: FreeWindow, state, lengths, unseen=None
+    ) -> np.ndarray:
+        """(n, n_channels) of a window. Args: lengths (n_bodies,): that a camera sees of
+        a metre. unseen: as of _unseen_spins()."""
+        start = np.empty((len(self.bodies), 13))
+        for k, (body, length) in enumerate(zip(bodies.each, lengths, strict=True)):
+            own = state[7 * k : 7 * k + 7]
+            q = own[:4, 0] / np.linalg.norm(own[:4, 0])
+            dq = own[:4, 1] - q * (q @ own[:4, 1])
+            place, velocity = own[4:, 0] / length, own[4:, 1] / length
+            spin = spin_of(q, dq)
+            rolls = w.rolling[k]
+            if rolls is not None:
+                if unseen and unseen[k]:
+                    spin, rolls = unseen[k]
+                gap, normal, _ = nearest(body, np.concatenate([q, place]))
+                if gap < TOUCHES * body.spheres[0, 3]:
+                    spin = rolls.spin(body, velocity, normal)
+            start[k] = np.concatenate([q, place, spin, velocity])
         times = self.recordings[w.recording].time[w.rows]
         filters = self._filters[w.recording]
         n = DENSE if filters and len(times) > 1 else 1
         rows = np.arange(len(times))
         dense = np.interp(np.arange(n * (len(times) - 1) + 1) / n, rows, times)
-        x = simulate(body, np.concatenate([q, place, spin, velocity]), dense)
-        x[:, 4:7] *= length
-        x[:, 10:] *= length
-        columns = [_STATE.index(c.rsplit(".", 1)[-1]) for c in self.channels]
-        y = x[:, columns]
+        x = simulate_all(bodies, start, dense)
+        x[:, :, 4:7] *= np.asarray(lengths)[:, None]
+        x[:, :, 10:] *= np.asarray(lengths)[:, None]
+        y = np.empty((len(dense), len(self.channels)))
         for k, channel in enumerate(self.channels):
+            name, what = channel.rsplit(".", 1)
+            y[:, k] = x[:, self.bodies.index(name), _STATE.index(what)]
             if channel in filters and n > 1:
                 y[:, k] = filtered(filters[channel], dense, y[:, k])
         return y[::n]
 
     def simulate(self, effects: Sequence[Effect] = ()) -> list[np.ndarray]:
         """(n, n_channels) of each window, in the scene with these effects added."""
-        body = self._numbers.body(effects) if effects else self._body
-        length = 1.0
+        bodies = self._numbers.bodies(effects) if effects else self._bodies
+        lengths = np.ones(len(self.bodies))
         for e in (*self.scene.effects, *effects):
-            if e.kind == "length_scale" and {
-                "world", self.name, self.name.split(".")[0],
-            } & set(e.at):  # fmt: skip
-                length *= e.parameters["scale"]
+            if e.kind == "length_scale":
+                for k, name in enumerate(self.bodies):
+                    if {"world", name, name.split(".")[0]} & set(e.at):
+                        lengths[k] *= e.parameters["scale"]
         self.runs += 1
-        each = [self._simulate(body, w, w.state, length) for w in self.windows]
+        each = [self._simulate(bodies, w, w.state, lengths) for w in self.windows]
         return [np.where(np.isnan(y), np.inf, y) for y in each]
 
     def errors(self, simulated: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -431,9 +511,11 @@ class FreeBodyModel(WindowedResidual):
     ) -> list[np.ndarray]:
         """The same over given deviations."""
         out = []
-        turn = [k for k, c in enumerate(self.channels) if c.rsplit(".", 1)[1] in TURN]
+        quaternions = [f"{name}.{a}" for name in self.bodies for a in TURN]
+        turns = [[k for k, c in enumerate(self.channels) if c in quaternions[i : i + 4]]
+                 for i in range(0, len(quaternions), 4)]  # fmt: skip
         for std, y, seen in zip(stds, simulated, self._seen, strict=True):
-            if turn:  # q and -q are one orientation.
+            for turn in filter(None, turns):  # q and -q are one orientation.
                 same = np.sign(np.nansum(y[:, turn] * seen[:, turn], axis=1))
                 y = np.array(y)
                 y[:, turn] *= np.where(same < 0, -1.0, 1.0)[:, None]
@@ -468,9 +550,7 @@ def lies_on_side(body: FreeBodyScene, recordings: Sequence[Recording]) -> bool:
 def _check_edges(body: FreeBody, name: str, recordings: Sequence[Recording]) -> None:
     """Raises: DoesNotFit where a body whose corners stand in for its faces comes to the
     edge of a fixed box, which would be between them."""
-    size = float(
-        (np.linalg.norm(body.spheres[:, :3], axis=1) + body.spheres[:, 3]).max()
-    )
+    size = _size(body)
     for recording in recordings:
         place = _poses(name, recording)[:, 4:]
         for each in body.fixed:
@@ -485,6 +565,12 @@ def _check_edges(body: FreeBody, name: str, recordings: Sequence[Recording]) -> 
                 raise DoesNotFit(f"{name} is near an edge of what it touches")
 
 
+def _size(body: FreeBody) -> float:
+    """How far it reaches from its origin [m]."""
+    reach = np.linalg.norm(body.spheres[:, :3], axis=1) + body.spheres[:, 3]
+    return float(reach.max())
+
+
 def _poses(name: str, recording: Recording) -> np.ndarray:
     """(n, 7) quaternion wxyz and place of a body, of rows that have all of it."""
     channels = [f"{name}.{a}" for a in (*TURN, *_PLACE)]
@@ -494,16 +580,23 @@ def _poses(name: str, recording: Recording) -> np.ndarray:
     return pose[np.isfinite(pose).all(axis=1)]
 
 
-def touched(model: FreeBodyModel) -> np.ndarray:
-    """(n, 2) where in x and y the body's spheres touched what is fixed, as measured."""
-    body, found = model.body, [np.zeros((0, 2))]
+def first_of(model: FreeBodyModel, at: str) -> str:
+    """The first body that a place, `<body>` or `<body>~<body>`, names."""
+    return next(name for name in at.split("~") if name in model.bodies)
+
+
+def touched(model: FreeBodyModel, at: str) -> np.ndarray:
+    """(n, 2) where in x and y the spheres of the first body that `at` names touched
+    what is fixed, as measured."""
+    body, found = model.body(at), [np.zeros((0, 2))]
+    name = first_of(model, at)
     for w in model.windows:
         recording = model.recordings[w.recording]
         pose = np.zeros((w.rows.stop - w.rows.start, 7))
         pose[:, 0] = 1.0
         for i, a in enumerate((*TURN, *_PLACE)):
-            if f"{model.name}.{a}" in recording:
-                pose[:, i] = recording[f"{model.name}.{a}"][w.rows]
+            if f"{name}.{a}" in recording:
+                pose[:, i] = recording[f"{name}.{a}"][w.rows]
         pose = pose[np.isfinite(pose).all(axis=1)]
         for row in pose[:: max(len(pose) // 20, 1)]:
             if lowest_gap(body, row) < NEAR:
