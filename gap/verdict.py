@@ -98,6 +98,11 @@ def withdraw_if_weak(
     return replace(selection, choices=(), end=selection.start), near
 
 
+def shows_in_equations_alone(gap: GapMeasure) -> bool:
+    """Whether simulated windows do not show what is left."""
+    return gap.window_s > 0.0 and gap.after <= AGREEMENT_RMS_MAX
+
+
 def two_figures(start: float, end: float, gap: GapMeasure) -> str:
     """A sentence where equations, whose error goes from start to end, and simulated
     windows disagree on what is left by more than a factor of two, or only equations
@@ -177,8 +182,10 @@ def says(
     effects: Sequence[NamedEffect],
     gap: GapMeasure,
     more: str = "",
+    left: float = 0.0,
 ) -> str:
-    """The first screen's sentence. more: what is to be added to it."""
+    """The first screen's sentence. more: what is to be added to it; left: the error in
+    the equations of motion, with all effects."""
     before, after = figure(gap.before), figure(gap.after)
     if verdict == "no_gap":
         return (
@@ -196,9 +203,15 @@ def says(
     words = " ".join(each.says for each in effects)
     if verdict == "gap_unnamed":
         head = f"{words} Beyond that, " if words else ""
+        error = f"{after} times the noise"
+        if shows_in_equations_alone(gap) and left > gap.after:
+            error = f"{figure(left)} times the noise in the equations of motion, "
+            error += f"{after} in simulated windows"
+        if words and gap.before > AGREEMENT_RMS_MAX:
+            error += f" ({before} without what is named)"
         return head + (
             f"{'a' if head else 'A'} gap remains that no effect of the catalogue "
-            f"explains: held-out error {after} times the noise.{more}"
+            f"explains: held-out error {error}.{more}"
         )
     tail = ""
     if verdict == "ambiguous":

@@ -69,6 +69,7 @@ from makebreak.gap.verdict import (
     figure,
     named,
     says,
+    shows_in_equations_alone,
     two_figures,
     verdict_of,
     why_not_confirmed,
@@ -340,7 +341,9 @@ def conclude(
     if verdict == "no_gap" and (unjudged := unjudged_channels(channels)):
         verdict = "not_judged"
         near += unjudged
-    near += two_figures(start, problem.error(selection.end), final.gap)
+    left = problem.error(selection.end)
+    if verdict != "gap_unnamed" or not shows_in_equations_alone(final.gap):
+        near += two_figures(start, left, final.gap)
     if turned and verdict in ("gap_named", "ambiguous"):
         verdict = "ambiguous"
         near += turned
@@ -362,7 +365,7 @@ def conclude(
     fixed = [c.fixed for c in selection.choices]
     prior = nuisances.prior
     return GapResult(
-        verdict, says(verdict, effects, final.gap, near),
+        verdict, says(verdict, effects, final.gap, near, left),
         problem.where(selection.start.left) if verdict not in AGREES else [], effects,
         final.gap, final.unexplained if verdict == "gap_unnamed" else [],
         {n: float(b / p) for n, b, p in

@@ -2,8 +2,8 @@
 
 import pytest
 
-from makebreak.gap.result import GapMeasure
-from makebreak.gap.verdict import two_figures
+from makebreak.gap.result import GapMeasure, NamedEffect
+from makebreak.gap.verdict import says, two_figures
 
 
 def measure(before: float, after: float, window_s: float = 0.3) -> GapMeasure:
@@ -44,3 +44,26 @@ def test_a_gap_that_simulation_does_not_show_is_told_by_the_equations():
     said = two_figures(11.0, 11.0, measure(1.2, 1.2))  # Nothing was named.
     assert "Simulated windows do not show this gap" in said
     assert "error is 11 times the noise" in said
+
+
+@pytest.mark.parametrize(
+    ("gap", "left", "said"),
+    [
+        (measure(12.0, 6.0), 9.0, "error 6 times the noise."),
+        (measure(1.1, 1.0), 70.0, "error 70 times the noise in the equations of motion, "
+                                  "1 in simulated windows."),
+        (measure(12.0, 6.0, 0.0), 9.0, "error 6 times the noise."),
+        (measure(1.1, 1.0), 0.9, "error 1 times the noise."),
+    ],
+)  # fmt: skip
+def test_a_gap_without_a_name_has_the_figure_that_shows_it(gap, left, said):
+    text = says("gap_unnamed", [], gap, "", left)
+    assert text.endswith(f"the catalogue explains: held-out {said}")
+
+
+def test_what_is_left_beside_what_is_named_has_both_figures():
+    effect = NamedEffect("payload", ("a.b",), {}, "It carries 2 kg.", None)  # type: ignore[arg-type]
+    said = says("gap_unnamed", [effect], measure(30.8, 0.28), "", 1.6)
+    assert "It carries 2 kg. Beyond that, a gap remains" in said
+    assert "1.6 times the noise in the equations of motion, 0.28 in simulated" in said
+    assert said.endswith("(30.8 without what is named).")
