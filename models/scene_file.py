@@ -25,13 +25,14 @@ def write_scene(
     stays. Defaults are left out.
 
     Args: heading: comment lines at the top; `makebreak list` shows the first one.
-        place: folder to which the file will be moved; None: it stays.
+        place: folder to which all files of the file's own will be moved; None: they
+        stay.
     Raises: ValueError as scene_text, or if the file cannot be written.
     """
     path = Path(path)
     text = "".join(f"# {line}".rstrip() + "\n" for line in heading.splitlines())
     try:
-        path.write_text(text + scene_text(scene, place or path.parent))
+        path.write_text(text + scene_text(scene, place or path.parent, path.parent))
     except OSError as error:
         path.unlink(missing_ok=True)
         raise ValueError(
@@ -39,16 +40,20 @@ def write_scene(
         ) from error
 
 
-def scene_text(scene: Scene, folder: str | Path) -> str:
+def scene_text(
+    scene: Scene, folder: str | Path, beside: str | Path | None = None
+) -> str:
     """The scene as YAML, for a file in `folder`.
 
+    Args: beside: folder whose files will lie in `folder` as well.
     Raises: ValueError for an effect of an unknown kind.
     """
+    to, moved = Path(folder), Path(folder if beside is None else beside)
     plain: dict[str, Any] = {
         f.name: _plain(getattr(scene, f.name)) for f in fields(scene)
     }
     plain["packages"] = {
-        name: _relative(where, Path(folder)) for name, where in scene.packages.items()
+        name: _relative(where, to, moved) for name, where in scene.packages.items()
     }
     plain["directives"] = [
         yaml_load(data=yaml_dump_typed(each)) for each in scene.directives
@@ -57,7 +62,7 @@ def scene_text(scene: Scene, folder: str | Path) -> str:
         for what in ("add_model", "add_directives"):
             if what in directive:
                 part = directive[what]
-                file = _relative(part.pop("file"), Path(folder))
+                file = _relative(part.pop("file"), to, moved)
                 name = {"name": part.pop("name")} if "name" in part else {}
                 directive[what] = name | {"file": file} | part
     effects = scene.effects
@@ -81,13 +86,16 @@ def scene_text(scene: Scene, folder: str | Path) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _relative(file: str, folder: Path) -> str:
-    """The file's path relative to the folder; unchanged if there is none."""
+def _relative(file: str, folder: Path, beside: Path) -> str:
+    """The file's path relative to the folder; unchanged if there is none. What lies in
+    `beside` comes along."""
     name = file.removeprefix("file://")
     if "://" in name:
         return file
     try:
-        return Path(os.path.relpath(Path(name).resolve(), folder.resolve())).as_posix()
+        path, moved = Path(name).resolve(), beside.resolve()
+        start = moved if path.is_relative_to(moved) else folder.resolve()
+        return Path(os.path.relpath(path, start)).as_posix()
     except ValueError:  # On another drive.
         return name
 

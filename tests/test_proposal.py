@@ -275,6 +275,11 @@ def test_a_robot_without_its_collision_meshes_is_compared(tmp_path):
         (tmp_path / "out" / name).write_text(copy)
     (tmp_path / "out" / "scene.yaml").write_text(proposal.scene)
     SceneDynamics(read_scene(tmp_path / "out" / "scene.yaml"))
+    # The result's scene is written elsewhere, and moved together with the copy.
+    out = tmp_path / "gap"
+    command = ["gap", str(tmp_path / "one.urdf"), str(tmp_path / "log.csv")]
+    assert main([*command, "--out", str(out), "--jobs", "1"]) == 0
+    SceneDynamics(read_scene(out / "scene.yaml"))
 
 
 def with_currents(folder):

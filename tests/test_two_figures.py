@@ -50,12 +50,16 @@ def test_a_gap_that_simulation_does_not_show_is_told_by_the_equations():
     ("gap", "left", "said"),
     [
         (measure(12.0, 6.0), 9.0, "error 6 times the noise."),
-        (measure(1.1, 1.0), 70.0, "error 70 times the noise in the equations of motion, "
-                                  "1 in simulated windows."),
+        (
+            measure(1.1, 1.0),
+            70.0,
+            "error 70 times the noise in the equations of motion, "
+            "1 in simulated windows.",
+        ),
         (measure(12.0, 6.0, 0.0), 9.0, "error 6 times the noise."),
         (measure(1.1, 1.0), 0.9, "error 1 times the noise."),
     ],
-)  # fmt: skip
+)
 def test_a_gap_without_a_name_has_the_figure_that_shows_it(gap, left, said):
     text = says("gap_unnamed", [], gap, "", left)
     assert text.endswith(f"the catalogue explains: held-out {said}")

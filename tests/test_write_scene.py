@@ -117,3 +117,17 @@ def test_a_place_that_cannot_be_written_and_an_unknown_kind_are_named(tmp_path):
         write_scene(scene, tmp_path / "missing" / "scene.yaml")
     with pytest.raises(ValueError, match="'no_such' is unknown"):
         scene_text(replace(scene, effects=[Effect("no_such", ["p"], {})]), tmp_path)
+
+
+def test_models_beside_a_file_move_with_it(tmp_path):
+    """Others stay where they are."""
+    stage, place = tmp_path / "out" / ".stage", tmp_path / "out"
+    stage.mkdir(parents=True)
+    scene = pendulum(stage)
+    (model,) = stage.glob("*.[us]*df")
+    write_scene(scene, stage / "scene.yaml", place=place)
+    for file in stage.iterdir():
+        file.rename(place / file.name)
+    load_scene(place / "scene.yaml", DiagramBuilder())
+    text = scene_text(pendulum(tmp_path), place, stage)
+    assert f"../{model.name}" in text
