@@ -203,3 +203,55 @@ def test_a_box_lands_on_corners_as_sharp_as_it_has(scene, tmp_path):
     gap = lowest_gap(body, np.array([*q, 0.0, 0.0, floor + 0.2]))
     # Spheres of 0.01 mm stand in for the corners.
     np.testing.assert_allclose(gap, 0.2 + lowest, atol=1e-5)
+
+
+def with_puck(scene, folder, friction: float):
+    """The scene with a cylinder in the place of the cube, and a wall at x = 0.5."""
+    surface = (
+        '<drake:proximity_properties xmlns:drake="drake.mit.edu">'
+        f"<drake:mu_static>{friction}</drake:mu_static>"
+        f"<drake:mu_dynamic>{friction}</drake:mu_dynamic>"
+        "<drake:point_contact_stiffness>60000</drake:point_contact_stiffness>"
+        "<drake:hunt_crossley_dissipation>0.5</drake:hunt_crossley_dissipation>"
+        "</drake:proximity_properties>"
+    )
+    shapes = {
+        "puck": "<cylinder><radius>0.04</radius><length>0.02</length></cylinder>",
+        "wall": "<box><size>0.2 2 2</size></box>",
+    }
+    inertial = (
+        "<inertial><mass>0.3</mass><inertia><ixx>1.3e-4</ixx><iyy>1.3e-4</iyy>"
+        "<izz>2.4e-4</izz></inertia></inertial>"
+    )
+    directives = list(scene.directives[:-1])
+    for name, shape in shapes.items():
+        place = '<pose relative_to="__model__">0.6 0 0 0 0 0</pose>' * (name == "wall")
+        (folder / f"{name}.sdf").write_text(
+            f'<sdf version="1.9"><model name="{name}"><static>{name == "wall"}</static>'
+            f'<link name="{name}">{place}{inertial * (name == "puck")}'
+            f'<collision name="c"><geometry>{shape}</geometry>{surface}</collision>'
+            "</link></model></sdf>"
+        )
+        more = copy.deepcopy(scene.directives[-1])
+        more.add_model.name, more.add_model.file = name, f"file://{folder}/{name}.sdf"
+        directives.append(more)
+    return replace(scene, directives=directives, initial=type(scene.initial)())
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.1, 0.26])
+def test_a_round_puck_meets_a_wall_as_a_circle_does(scene, tmp_path, yaw):
+    """Spheres along its rim, 30 degrees apart, made a polygon of it, whose corners turn
+    it where they hit. What a wall without friction does is the same at any yaw, and
+    what friction turns it by is a closed form while it slips: izz w = r mu m dv."""
+    for mu in (0.0, 0.05):
+        numbers = FreeBodyScene(with_puck(scene, tmp_path, mu))
+        body = replace(numbers.body(), gravity=np.zeros(3))
+        q = [np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]
+        start = np.array([*q, 0.4, 0, 0.5, 0, 0, 0, 1.0, 0.5, 0.0])
+        x = simulate(body, start, np.array([0.0, 0.15]), tol=1e-8)[-1]
+        assert x[10] < -0.5  # It came back.
+        change = mu * (1.0 - x[10])
+        np.testing.assert_allclose(x[11], 0.5 - change, atol=1e-4)
+        # The point of contact is a little within the rim: by half of 2 mm of 40.
+        want = -0.04 * 0.3 * change / 2.4e-4
+        np.testing.assert_allclose(x[7:10], [0.0, 0.0, want], rtol=0.05, atol=1e-3)

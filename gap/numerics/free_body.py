@@ -18,6 +18,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numba import njit
 
+EDGE, FACE = 1.0, 2.0
+# Sine of the angle from a cylinder's axis to the normal of what it touches, between
+# which its face gives way to its edge; and that of the side's angle to it below which
+# the edges of both ends begin to share the load.
+LEAN, SIDE = (0.1, 0.3), 0.1
 MOST_STEPS = 40_000  # Of one run: beyond it the parameters are given up.
 
 
@@ -33,7 +38,11 @@ class FreeBody:
     resistance [m].
     forces (p, 6): fx, fy, fz [N, world, on the body's origin], frequency [Hz] (0:
     constant), phase, 0. patches (k, 6): number of a fixed shape, and the friction there
-    where x and y of the world are within x_min, x_max, y_min, y_max.
+    where x and y of the world are within x_min, x_max, y_min, y_max. rims (n, 5): of
+    the spheres that stand in for a cylinder: its axis (3), the radius of a circle about
+    the sphere's centre [m], and what the sphere is: EDGE touches with the point of the
+    circle that is farthest along a normal which is across the axis, FACE where the
+    normal is along the axis; 0: a sphere as it is.
     """
 
     mass: float
@@ -49,6 +58,7 @@ class FreeBody:
     slip: float = 1e-3  # v_s [m/s]
     fade: float = 0.05  # Below this rate rolling resistance fades [rad/s].
     patches: np.ndarray = field(default_factory=lambda: np.zeros((0, 6)))
+    rims: np.ndarray | None = None
 
     def __post_init__(self):
         shape = (len(self.spheres), len(self.fixed), 6)
@@ -116,11 +126,16 @@ def simulate_all(
         each[0].gravity, np.concatenate([body.spheres for body in each]),
         np.repeat(np.arange(len(each)), count), each[0].fixed,
         np.concatenate([body.pairs for body in each]),
-        np.concatenate([body.levers for body in each]), bodies.mutual,
+        np.concatenate([body.levers for body in each]),
+        np.concatenate([_rims(body) for body in each]), bodies.mutual,
         owned([body.forces for body in each], 6),
         np.array([body.drag for body in each]), each[0].slip, each[0].fade,
         owned([body.patches for body in each], 6), max_step, tol,
     )  # fmt: skip
+
+
+def _rims(body: FreeBody) -> np.ndarray:
+    return np.zeros((len(body.spheres), 5)) if body.rims is None else body.rims
 
 
 def placed(pose, points) -> np.ndarray:
@@ -278,7 +293,7 @@ def _meet(F, T, s, c, spheres, owner, i, j, law, slip):
 
 @njit(cache=True)
 def _rate(t, s, mass, com, inertia, inverse, gravity, spheres, owner, fixed, pairs,
-          levers, mutual, forces, drag, slip, fade, patches, dx):  # fmt: skip
+          levers, rims, mutual, forces, drag, slip, fade, patches, dx):  # fmt: skip
     """State s (n_bodies, 13): quaternion (4), centre of mass (3), w in world (3), its
     velocity (3)."""
     N = len(mass)
@@ -308,6 +323,7 @@ def _rate(t, s, mass, com, inertia, inverse, gravity, spheres, owner, fixed, pai
             T[b, i] = -drag[b, 1] * s[b, 7 + i]
         _push(F, T, b, o[b, 0], o[b, 1], o[b, 2], f[b, 0], f[b, 1], f[b, 2])
     c = np.empty((len(spheres), 3))
+    axis, at = np.empty(3), np.empty(3)
     b, R = -1, turned[0]
     for j in range(len(spheres)):
         if owner[j] != b:
@@ -321,24 +337,46 @@ def _rate(t, s, mass, com, inertia, inverse, gravity, spheres, owner, fixed, pai
         )
         for i in range(3):
             c[j, i] = s[b, 4 + i] + R[i, 0] * b0 + R[i, 1] * b1 + R[i, 2] * b2
-        radius = spheres[j, 3]
+        radius, what = spheres[j, 3], rims[j, 4]
         for m in range(len(fixed)):
-            if _is_apart(c[j, 0], c[j, 1], c[j, 2], radius, fixed[m]):
+            p0, p1, p2, share_of = c[j, 0], c[j, 1], c[j, 2], 1.0
+            if _is_apart(p0, p1, p2, radius + rims[j, 3], fixed[m]):
                 continue
             gap, n = _gap(c[j], radius, fixed[m])
+            if what > 0.0:
+                for i in range(3):
+                    axis[i] = 0.0
+                    for k in range(3):
+                        axis[i] += R[i, k] * rims[j, k]
+                along = n[0] * axis[0] + n[1] * axis[1] + n[2] * axis[2]
+                lean = np.sqrt(max(1.0 - along * along, 0.0))
+                x = min(max((lean - LEAN[0]) / (LEAN[1] - LEAN[0]), 0.0), 1.0)
+                x *= x * (3.0 - 2.0 * x)
+                share_of = x if what == EDGE else 1.0 - x
+                if share_of <= 0.0:
+                    continue
+                if what == EDGE:
+                    share_of *= 0.5 + 0.5 * min(abs(along) / SIDE, 1.0)
+                    far = rims[j, 3] / lean
+                    p0 -= far * (n[0] - along * axis[0])
+                    p1 -= far * (n[1] - along * axis[1])
+                    p2 -= far * (n[2] - along * axis[2])
+                    at[0], at[1], at[2] = p0, p1, p2
+                    gap, n = _gap(at, radius, fixed[m])
             if gap >= 0.0:
                 continue
             depth = -gap
             reach = radius - (1.0 - pairs[j, m, 4]) * depth
-            a0 = c[j, 0] - s[b, 4] - reach * n[0]
-            a1 = c[j, 1] - s[b, 5] - reach * n[1]
-            a2 = c[j, 2] - s[b, 6] - reach * n[2]
+            a0 = p0 - s[b, 4] - reach * n[0]
+            a1 = p1 - s[b, 5] - reach * n[1]
+            a2 = p2 - s[b, 6] - reach * n[2]
             u0 = s[b, 10] + w1 * a2 - w2 * a1
             u1 = s[b, 11] + w2 * a0 - w0 * a2
             u2 = s[b, 12] + w0 * a1 - w1 * a0
             un = u0 * n[0] + u1 * n[1] + u2 * n[2]
             fn = pairs[j, m, 0] * depth * (1.0 - pairs[j, m, 1] * un)
             fn -= pairs[j, m, 5] * un
+            fn *= share_of
             if fn <= 0.0:
                 continue
             u0 -= un * n[0]
@@ -352,8 +390,8 @@ def _rate(t, s, mass, com, inertia, inverse, gravity, spheres, owner, fixed, pai
                     if (
                         patches[k, 0] == m
                         and patches[k, 6] == b
-                        and patches[k, 2] < c[j, 0] < patches[k, 3]
-                        and patches[k, 4] < c[j, 1] < patches[k, 5]
+                        and patches[k, 2] < p0 < patches[k, 3]
+                        and patches[k, 4] < p1 < patches[k, 5]
                     ):
                         mu_s = mu_d = patches[k, 1]
                 mu = _friction(speed, slip, mu_s, mu_d)
@@ -410,7 +448,7 @@ def _rate(t, s, mass, com, inertia, inverse, gravity, spheres, owner, fixed, pai
 
 @njit(cache=True)
 def _run(start, times, mass, com, inertia, inverse, gravity, spheres, owner, fixed,
-         pairs, levers, mutual, forces, drag, slip, fade, patches, max_step,
+         pairs, levers, rims, mutual, forces, drag, slip, fade, patches, max_step,
          tol):  # fmt: skip
     n, N = len(times), len(mass)
     out = np.full((n, N, 13), np.nan)
@@ -428,7 +466,7 @@ def _run(start, times, mass, com, inertia, inverse, gravity, spheres, owner, fix
     k3, k4 = np.empty((N, 13)), np.empty((N, 13))
     t, h, steps = times[0], 1e-4, 0
     _rate(t, s, mass, com, inertia, inverse, gravity, spheres, owner, fixed, pairs,
-          levers, mutual, forces, drag, slip, fade, patches, k1)  # fmt: skip
+          levers, rims, mutual, forces, drag, slip, fade, patches, k1)  # fmt: skip
     for i in range(n):
         while t < times[i] - 1e-12:
             steps += 1
@@ -437,14 +475,14 @@ def _run(start, times, mass, com, inertia, inverse, gravity, spheres, owner, fix
             h = min(h, max_step)
             step = min(h, times[i] - t)
             _rate(t + 0.5 * step, s + 0.5 * step * k1, mass, com, inertia, inverse,
-                  gravity, spheres, owner, fixed, pairs, levers, mutual, forces, drag,
-                  slip, fade, patches, k2)  # fmt: skip
+                  gravity, spheres, owner, fixed, pairs, levers, rims, mutual, forces,
+                  drag, slip, fade, patches, k2)  # fmt: skip
             _rate(t + 0.75 * step, s + 0.75 * step * k2, mass, com, inertia, inverse,
-                  gravity, spheres, owner, fixed, pairs, levers, mutual, forces, drag,
-                  slip, fade, patches, k3)  # fmt: skip
+                  gravity, spheres, owner, fixed, pairs, levers, rims, mutual, forces,
+                  drag, slip, fade, patches, k3)  # fmt: skip
             new = s + step * (2.0 / 9.0 * k1 + 1.0 / 3.0 * k2 + 4.0 / 9.0 * k3)
             _rate(t + step, new, mass, com, inertia, inverse, gravity, spheres, owner,
-                  fixed, pairs, levers, mutual, forces, drag, slip, fade, patches,
+                  fixed, pairs, levers, rims, mutual, forces, drag, slip, fade, patches,
                   k4)  # fmt: skip
             worst = 0.0
             for b in range(N):

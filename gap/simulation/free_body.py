@@ -11,7 +11,7 @@ from pydrake.multibody.tree import BodyIndex, RigidBody
 from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.gap.does_not_fit import DoesNotFit
-from makebreak.gap.numerics.free_body import FreeBody
+from makebreak.gap.numerics.free_body import EDGE, FACE, FreeBody
 from makebreak.gap.simulation.face_supports import (
     INNER,
     POINT,
@@ -26,7 +26,8 @@ from makebreak.models.effects.kind import Effect, check_parameters, full_name
 from makebreak.models.effects.rolling_resistance import FADE_RATE
 from makebreak.models.scene import LoadedScene, Scene, load_scene
 
-SPHERE, CORNER, WITHIN = range(3)  # What a sphere is: the body's own, or stands in.
+# What a sphere is: the body's own, or stands in for a corner, a face or a round edge.
+SPHERE, CORNER, WITHIN, ROUND = range(4)
 REST_DEPTH = 2e-5  # [m] Of a body on a face that is not stiffer than it need be.
 AT_CORNERS = 0.4  # Of a face's load; it is 0.16 (a disc's rim: 0.33) if pressed evenly.
 # Forces that have their own numbers here; what changes shapes, inertias and surfaces is
@@ -106,7 +107,8 @@ class FreeBodyScene:
     def ease(self) -> None:
         """Makes faces no stiffer than what lies on them needs to be carried. Of what
         never hits anything, a stiffness shows nowhere but in how short steps are."""
-        k = self.body().pairs[self._numbers.role != SPHERE, :, 0].sum(axis=0).max()
+        faces = np.isin(self._numbers.role, (CORNER, WITHIN))
+        k = self.body().pairs[faces, :, 0].sum(axis=0).max()
         weight = float(self._numbers.mass) * float(np.linalg.norm(self._gravity))
         self._eased = min(1.0, weight / REST_DEPTH / max(0.5 * k, 1e-9))
 
@@ -155,7 +157,7 @@ class FreeBodyScene:
             float(now.mass), now.com, now.inertia, self._gravity, now.spheres,
             now.fixed, pairs,
             now.rolling[None, :] * now.spheres[:, 3:], now.forces, now.drag,
-            fade=FADE_RATE, patches=now.patches,
+            fade=FADE_RATE, patches=now.patches, rims=now.rims,
         )  # fmt: skip
 
     def _read(self, loaded: LoadedScene, body: RigidBody) -> None:
@@ -164,7 +166,7 @@ class FreeBodyScene:
         if not mine:
             raise DoesNotFit(f"{self.name} has nothing to touch with")
         self.axes: list[np.ndarray] = []  # Of its cylinders, in the body's frame.
-        spheres, role, of = [], list[int](), list[int]()
+        spheres, rims, role, of = [], [], list[int](), list[int]()
         inner = 0.0
         for i, g in enumerate(mine):
             shape, X = inspector.GetShape(g), inspector.GetPoseInFrame(g)
@@ -178,10 +180,19 @@ class FreeBodyScene:
                 if not (self._on_side and isinstance(shape, Cylinder)):
                     each += [(WITHIN, list(s)) for s in within_faces(shape, POINT)]
                     inner = 1.0 if isinstance(shape, Box) else RIM / INNER
+            axis, rim, stands = X.rotation().col(2), 0.0, False
             if isinstance(shape, Cylinder):
-                self.axes.append(X.rotation().col(2))
+                self.axes.append(axis)
+                stands, rim = not self._on_side, shape.radius() - POINT
+                h = 0.5 * shape.length() - POINT
+            if stands:
+                # Its rims are round: the spheres along them carry its faces alone.
+                each += [(ROUND, [0.0, 0.0, z, POINT]) for z in (-h, h)]
             for what, (*p, radius) in each:
                 spheres.append([*(X @ np.array(p)), radius])
+                edge = what == ROUND
+                kind = (EDGE if edge else FACE) if stands else 0.0
+                rims.append([*axis, rim if edge else 0.0, kind])
                 role.append(what)
                 of.append(i)
         context = plant.CreateDefaultContext()
@@ -225,6 +236,7 @@ class FreeBodyScene:
             np.array([_surface(inspector, g) for g in others]).reshape(-1, 4),
             np.zeros(len(others)), np.zeros((0, 6)), np.zeros(2), np.zeros((0, 6)),
             np.full(len(others), np.nan), np.array(role), np.array(inner),
+            np.array(rims),
         )  # fmt: skip
         for effect in loaded.effects:
             if effect.kind in FORCES:
@@ -240,7 +252,7 @@ class Numbers:
     """What effects change. own (n, 4), other (m, 4): stiffness (inf: Drake's guess),
     dissipation, static and dynamic friction of each surface; rolling (m,); damper (m,):
     in the place of the dissipation, NaN where there is none; role (n,) of each sphere;
-    inner: corners of a face for each sphere within it."""
+    inner: corners of a face for each sphere within it; rims (n, 5) as of FreeBody."""
 
     mass: np.ndarray
     com: np.ndarray
@@ -257,6 +269,7 @@ class Numbers:
     damper: np.ndarray
     role: np.ndarray
     inner: np.ndarray
+    rims: np.ndarray
 
 
 def _surface(inspector, geometry) -> list[float]:
@@ -319,6 +332,7 @@ def combined(own, other, damper, drake: Drakes) -> np.ndarray:
 def _size(now: Numbers, p, on) -> None:
     scale = p["scale"] if "scale" in p else p["radius"] / now.spheres[0, 3]
     now.spheres *= scale
+    now.rims[:, 3] *= scale
     now.com *= scale
     now.inertia *= scale**2
 
