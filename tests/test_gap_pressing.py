@@ -125,10 +125,11 @@ def contact(p, v, table, wall, mu, longer=0.0, points=MIDDLE):
 def record(
     folder, table=0.0, wall=0.3, mu=(TABLE_MU, WALL_MU), wrench=True, n=1, longer=0.0,
     effort="effort_command", mass=MASS, high=0.0, waits=0.0, force=8.0,
-    points=MIDDLE,
+    points=MIDDLE, leaves=np.inf,
 ):  # fmt: skip
     """After a while down on the table, along it to the wall, along both, pressed with a
-    force; high: from so much higher, which with no force stays above the table."""
+    force; high: from so much higher, which with no force stays above the table; leaves:
+    when it goes up along the wall for half a second, and then away from it [s]."""
     rng = np.random.default_rng(0)
     names = ("x", "y", "z")
     tables = []
@@ -143,8 +144,12 @@ def record(
                 0.02 if t < 3.0 else 0.2 * (1.0 if (t + episode) % 2.0 < 1.0 else -1.0),
                 -0.15 if 0.0 < t < 1.2 else 0.0,
             ])  # fmt: skip
-            u = mass * 25.0 * (target - v)
             pressed = [force * (t > 3.0), 0.0, -force * (t > 1.2)]
+            if t > leaves:
+                is_up = t > leaves + 0.5
+                target = np.array([-0.1 * is_up, 0.0, 0.3 * (not is_up)])
+                pressed = [force * (not is_up), 0.0, 0.0]
+            u = mass * 25.0 * (target - v)
             u = np.clip(u, -12.0, 12.0) + pressed + np.array([0.0, 0.0, mass * 9.81])
             F = contact(p, v, table, wall, mu, longer, points)
             states.append(state)
@@ -289,6 +294,23 @@ def test_a_wall_is_felt_though_the_tool_is_below_it_as_the_scene_has_it(tmp_path
     off = {problem.shapes.names[k]: by for k, by in problem.off.items()}
     assert off[TABLE]["z"] == pytest.approx(-0.045, abs=1e-3)
     assert off[WALL]["x"] == pytest.approx(0.022, abs=1e-3)
+
+
+def test_no_test_function_is_lost_to_a_face_that_is_ruled_out_by_what_is_felt(
+    tmp_path, monkeypatch
+):
+    """A ball goes up along a low wall: it comes past the wall's upper edge as it would
+    be on the table of the scene, but the table is 30 mm lower."""
+    scene = write_scene(tmp_path, wall_size=(0.1, 1.0, 0.055))
+    recordings = record(tmp_path, table=-0.03, wall=0.275, leaves=2.42)
+    problem = PressingProblem(scene, recordings)
+    off = {problem.shapes.names[k]: by for k, by in problem.off.items()}
+    assert off[TABLE]["z"] == pytest.approx(-0.03, abs=1e-3)
+    assert off[WALL]["x"] == pytest.approx(-0.025, abs=1e-3)
+    assert problem.faces == []  # None may be felt beside these two.
+    monkeypatch.setattr(PressingProblem, "_rule_out_faces", lambda self: None)
+    fewer = PressingProblem(scene, recordings)
+    assert set(fewer.means.time) < set(problem.means.time)
 
 
 @pytest.mark.parametrize(

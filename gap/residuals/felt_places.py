@@ -121,13 +121,42 @@ class FeltPlaces(FixedFaces):
         m.acceleration, self._a_covariance = a, covariance
 
     def _prepare(self) -> None:
+        self.off: dict[int, dict[str, float]] = {}
+        self._prepare_contacts()
+        while (off := self._felt_faces(self.off)) != self.off:
+            # A face that is ruled out by what is felt makes no contact that comes or
+            # goes: there are more test functions, and others may be felt in them.
+            self.off = off
+            self._rule_out_faces()
+            self.means = self._all_means()
+            self._find_contacts()
+            self._prepare_contacts()
+        self._pressed, self._met = self._pressing()
+        self._pairs_met = sorted({*self._met, *map(self._pair_of, self.slots)})
+
+    def _prepare_contacts(self) -> None:
         geometry = self._geometry(())
         self.slots = geometry.slots
         self._masks = [geometry.masks[s.key] for s in self.slots]
         super()._prepare()
-        self.off = self._felt_faces()
-        self._pressed, self._met = self._pressing()
-        self._pairs_met = sorted({*self._met, *map(self._pair_of, self.slots)})
+
+    def _rule_out_faces(self) -> None:
+        """Leaves of the faces those that may still be felt beside what is, and of the
+        rows in touch (`_touching`) those in the scene, where bodies are felt, and at
+        these faces."""
+        number_of = {f: -1 - k for k, f in enumerate(self.faces)}
+        self.faces = [
+            f for f in self.faces
+            if self._is_of(f, self.off) and not f.is_alone
+            and AXES[f.axis] not in self.off.get(f.body, {})
+        ]  # fmt: skip
+        ruled_out = set(number_of.values()) - {number_of[f] for f in self.faces}
+        self._touching = {
+            key: on for key, on in self._touching.items() if key[0] not in ruled_out
+        }
+        free = min((k for key in self._touching for k in key), default=0) - 1
+        where_felt = self._touching_where_felt()
+        self._touching |= {(free, *pair): on for pair, on in where_felt.items()}
 
     def _displacing(self, off: dict[int, dict[str, float]]) -> list[Effect]:
         """Effects of bodies that are off, and of what stands on them."""
@@ -141,22 +170,34 @@ class FeltPlaces(FixedFaces):
 
     def touches_where_felt(self) -> np.ndarray:
         """(n_rows,) whether a face is touched that is felt elsewhere, where it is."""
+        every = [np.zeros(len(self._q), bool), *self._touching_where_felt().values()]
+        return np.any(every, axis=0)
+
+    def _touching_where_felt(self) -> dict[tuple[int, int], np.ndarray]:
+        """{pair: (n_rows,) whether it touches} of bodies that are felt elsewhere."""
         poses = self._poses_at(self._q)
+        moved = set()
         for e in self._displacing(self.off):
             (k,) = [k for k, name in self.shapes.names.items() if name == e.at[0]]
+            moved.add(k)
             R, p = poses[k]
             poses[k] = R, p + [e.parameters.get(a, 0.0) for a in AXES]
-        found = np.zeros(len(self._q), bool)
+        found: dict[tuple[int, int], np.ndarray] = {}
         for s in self.shapes.slots(poses, MEETS):
-            if {s.a, s.b} & set(self.off):
-                found |= s.phi < MEETS
+            if moved & {s.a, s.b}:
+                pair = self._pair_of(s)
+                now = found.get(pair, np.zeros(len(self._q), bool))
+                found[pair] = now | (s.phi < MEETS)
         return found
 
-    def _felt_faces(self) -> dict[int, dict[str, float]]:
-        """{body: {axis: by how far [m]}} of faces that are off and felt, or passed."""
+    def _felt_faces(
+        self, off: dict[int, dict[str, float]]
+    ) -> dict[int, dict[str, float]]:
+        """{body: {axis: by how far [m]}} of faces that are off and felt, or passed,
+        beside those that are known."""
         left = [f for f in self.faces if abs(f.off) > SAME]
         left.sort(key=lambda f: -abs(f.normal @ UP))  # What others stand on first.
-        return self._completed({}, left)
+        return self._completed(off, left)
 
     def _completed(
         self,
@@ -296,9 +337,8 @@ class FeltPlaces(FixedFaces):
         return more
 
     def _add(self, off: dict[int, dict[str, float]], face: Face) -> None:
-        axis = int(np.argmax(np.abs(face.normal)))
         by = off.setdefault(face.body, {})
-        by[AXES[axis]] = face.off / float(face.normal[axis])
+        by[AXES[face.axis]] = face.off / float(face.normal[face.axis])
 
     def _mean_squares(self, off) -> np.ndarray:
         """(K,) of what equations and wrenches leave with bodies displaced."""

@@ -41,6 +41,11 @@ class Face:
     is_alone: bool = False
 
     @property
+    def axis(self) -> int:
+        """Of the world, along which it may be off."""
+        return int(np.argmax(np.abs(self.normal)))
+
+    @property
     def by(self) -> np.ndarray:
         """(3,) by which the body is displaced [m]."""
         return self.off * self.normal + self.lift * UP

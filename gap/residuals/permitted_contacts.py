@@ -90,6 +90,12 @@ class PermittedContacts(ContactMeans):
     def __init__(self, scene: Scene, recordings: Sequence[Recording]):
         super().__init__(scene, recordings)
         self._context = self.plant.CreateDefaultContext()
+        self._find_contacts()
+
+    # ----- Geometry at nodes
+
+    def _find_contacts(self) -> None:
+        """What may touch in the test functions that there are."""
         self._geometries: dict[tuple, Geometry] = {}
         self._lying: dict[tuple[int, int], bool] = {}
         self._find_slots()
@@ -102,8 +108,6 @@ class PermittedContacts(ContactMeans):
             {self._pair_of(s) for s, on in zip(self.slots, self._masks, strict=True)
              if on.any()}
         )  # fmt: skip
-
-    # ----- Geometry at nodes
 
     def _find_slots(self) -> None:
         self._evaluate_nodes()
