@@ -6,6 +6,7 @@ from itertools import product
 
 import numpy as np
 import pytest
+from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.data.table import write_recording
@@ -18,6 +19,7 @@ from makebreak.gap.search.choice import Choice
 from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.search.rivals import still_tied
 from makebreak.gap.search.select import select
+from makebreak.gap.simulation.contact_windows import LAW, PushWindows
 from makebreak.gap.workflow import (
     conclude,
     judged_channels,
@@ -27,7 +29,7 @@ from makebreak.gap.workflow import (
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
-from makebreak.models.scene import read_scene
+from makebreak.models.scene import load_scene, read_scene
 
 GRAVITY = np.array([0.0, 0.0, 9.81])
 MASS, RADIUS, STIFFNESS, DAMPING, TABLE_MU, WALL_MU = 2.0, 0.02, 2e4, 200.0, 0.3, 0.2
@@ -125,11 +127,12 @@ def contact(p, v, table, wall, mu, longer=0.0, points=MIDDLE):
 def record(
     folder, table=0.0, wall=0.3, mu=(TABLE_MU, WALL_MU), wrench=True, n=1, longer=0.0,
     effort="effort_command", mass=MASS, high=0.0, waits=0.0, force=8.0,
-    points=MIDDLE, leaves=np.inf,
+    points=MIDDLE, leaves=np.inf, swells=0.0,
 ):  # fmt: skip
     """After a while down on the table, along it to the wall, along both, pressed with a
-    force; high: from so much higher, which with no force stays above the table; leaves:
-    when it goes up along the wall for half a second, and then away from it [s]."""
+    force, which swells by a share; high: from so much higher, which with no force stays
+    above the table; leaves: when it goes up along the wall for half a second, and then
+    away from it [s]."""
     rng = np.random.default_rng(0)
     names = ("x", "y", "z")
     tables = []
@@ -144,7 +147,8 @@ def record(
                 0.02 if t < 3.0 else 0.2 * (1.0 if (t + episode) % 2.0 < 1.0 else -1.0),
                 -0.15 if 0.0 < t < 1.2 else 0.0,
             ])  # fmt: skip
-            pressed = [force * (t > 3.0), 0.0, -force * (t > 1.2)]
+            push = force * (1.0 + swells * np.sin(4.0 * t))
+            pressed = [push * (t > 3.0), 0.0, -push * (t > 1.2)]
             if t > leaves:
                 is_up = t > leaves + 0.5
                 target = np.array([-0.1 * is_up, 0.0, 0.3 * (not is_up)])
@@ -601,6 +605,106 @@ def test_a_soft_contact_that_equations_take_for_a_place_is_told_by_simulation(tm
     # In a row with the tool's 2e6 N/m.
     stiffness = found["contact_stiffness", f"{TABLE}~gantry.tool"]["stiffness"].value
     assert stiffness == pytest.approx(2e4 / 0.99, rel=0.1)
+
+
+def test_a_soft_contact_that_is_softer_is_no_face_that_stands_elsewhere(
+    tmp_path, monkeypatch
+):
+    """The scene has 2000 N/m, the world 700: a tool that is 18 mm deep went through no
+    face, and forces of several sizes tell a stiffness from a place."""
+    monkeypatch.setattr(sys.modules[__name__], "STIFFNESS", 700.0)
+    monkeypatch.setattr(sys.modules[__name__], "DAMPING", 30.0)
+    scene = write_scene(tmp_path, stiffness="4e3")
+    problem = PressingProblem(scene, record(tmp_path, wrench=False, swells=0.5))
+    assert problem.off == {}
+    assert {problem.shapes.names[k] for k in problem.soft} == {TABLE, WALL}
+    found = {(c.effect.kind, *c.effect.at): c.effect.parameters
+             for c in select(problem).choices}  # fmt: skip
+    for body in (TABLE, WALL):
+        stiffness = found["contact_stiffness", f"{body}~gantry.tool"]["stiffness"]
+        assert stiffness == pytest.approx(700.0, rel=0.1)
+    assert len(found) == 2
+
+
+@pytest.mark.parametrize("tool", [1e4, 6e4])
+def test_forces_act_where_drake_has_them_between_two_soft_shapes(tmp_path, tool):
+    write_scene(tmp_path, stiffness="2e4")
+    file = tmp_path / "gantry.sdf"
+    file.write_text(file.read_text().replace("2e4\n", f"{tool:.0f}\n"))
+    scene = read_scene(tmp_path / "scene.yaml")
+    problem = PressingProblem(scene, record(tmp_path))
+    builder = DiagramBuilder()
+    plant = load_scene(scene, builder).plant
+    context = builder.Build().CreateDefaultContext()
+    own = plant.GetMyMutableContextFromRoot(context)
+    plant.get_actuation_input_port().FixValue(own, np.zeros(plant.num_actuators()))
+    pair = [s for s in problem.slots if problem.shapes.names[s.b] == TABLE]
+    [slot] = [s for s in pair if (s.phi < -1e-4).any()]
+    node = int(np.argmin(slot.phi))
+    plant.SetPositions(own, problem._q[problem._rows[node]])
+    results = plant.get_contact_results_output_port().Eval(own)
+    every = map(results.point_pair_contact_info,
+                range(results.num_point_pair_contacts()))  # fmt: skip
+    [point] = [
+        x.contact_point() for x in every if abs(x.point_pair().nhat_BA_W[2]) > 0.9
+    ]
+    np.testing.assert_allclose(slot.place[node], point, atol=1e-9)
+
+
+ARM = """<link name="base"/>{a}{b}
+<joint name="j" type="revolute"><parent>base</parent><child>a</child>
+<axis><xyz>0 0 1</xyz></axis></joint>
+<joint name="k" type="revolute"><pose relative_to="a">0.3 0 0 0 0 0</pose>
+<parent>a</parent><child>b</child><axis><xyz>0 0 1</xyz></axis></joint>"""
+
+
+def test_an_arm_that_swings_fast_needs_what_its_drives_give(tmp_path):
+    """Its mass matrix changes by half within a tenth of a second: the mean of a product
+    is not that of means. The efforts are what the motion needs, nothing is touched."""
+    shape = SHAPE.format(at="0.3 0 0 0 0 0", what=BALL, mu=1.0)
+    middle = "<inertial><pose>0.15 0 0 0 0 0</pose>"
+    links = {
+        x: LINK.format(name=x, mass=2.0, shape=shape).replace("<inertial>", middle)
+        for x in "ab"
+    }
+    write_scene(tmp_path)
+    body = ARM.format(**links).replace(
+        'name="b">', 'name="b"><pose>0.3 0 0 0 0 0</pose>'
+    )
+    (tmp_path / "gantry.sdf").write_text(MODEL.format(name="gantry", body=body))
+    text = SCENE.replace("[gantry.x, gantry.y, gantry.z]", "[gantry.j, gantry.k]")
+    (tmp_path / "scene.yaml").write_text(text.replace("[0.3, 0, 0]", "[0.7, 0, 0]"))
+    scene = read_scene(tmp_path / "scene.yaml")
+    dynamics = SceneDynamics(scene)
+    time, rate = np.arange(0.0, 8.0, 2e-3), np.array([5.0, 9.0])
+    wide, angle = np.array([0.5, 1.2]), rate * time[:, None] + [0.0, 1.0]
+    q, v = wide * np.sin(angle), wide * rate * np.cos(angle)
+    vd = -wide * rate**2 * np.sin(angle)
+    u = dynamics.inverse_dynamics(q, v, vd)
+    rng = np.random.default_rng(0)
+    write_recording(tmp_path / "recording.csv", {
+        "time": time,
+        **{f"gantry.{x}.position": q[:, i] + 1e-6 * rng.normal(size=len(time))
+           for i, x in enumerate("jk")},
+        **{f"gantry.{x}.effort_measured": u[:, i] for i, x in enumerate("jk")},
+    })  # fmt: skip
+    problem = PressingProblem(scene, read_recordings([tmp_path / "recording.csv"]))
+    left, given = problem._needs, problem.means.effort
+    assert np.sqrt(np.mean(left**2)) < 3e-3 * np.sqrt(np.mean(given**2))
+
+
+def test_windows_of_what_presses_know_no_friction_better_than_its_law(right):
+    """2 % of both frictions, 0.08 N of 2 kg, are 5 mm after half a second."""
+    scene, recordings, problem = right
+    assert set(problem.pressed()) == {f"{TABLE}~gantry.tool", f"{WALL}~gantry.tool"}
+    sure, unsure = (PushWindows(scene, recordings, pairs=pairs)
+                    for pairs in ((), problem.pressed()))  # fmt: skip
+    y, w = sure.channels.index("gantry.y.position"), sure.windows[-1]
+    assert w.start > 5.0  # It slides along both.
+    seconds = float(np.ptp(recordings[w.recording].time[w.rows]))
+    known, more = (each.windows[-1].std[-1, y] for each in (sure, unsure))
+    off = LAW * (TABLE_MU + WALL_MU) * 8.0 / MASS * seconds**2 / 2.0
+    assert np.sqrt(more**2 - known**2) == pytest.approx(off, rel=0.1)
 
 
 def test_no_place_has_a_body_where_the_tool_has_passed_freely(displaced):

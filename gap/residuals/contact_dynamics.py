@@ -67,7 +67,8 @@ class ContactDynamics(PermittedContacts):
         self._condition()
         q, v = self._q[m.centre], self._W @ self._node_v
         self.motion = Motion(m.time, q, v, m.acceleration, m.effort)
-        needs = self._still + np.einsum("kij,kj->ki", self._M, m.acceleration)
+        more = m.acceleration - self._mean_vd
+        needs = self._needed_smoothed + np.einsum("kij,kj->ki", self._M, more)
         self._needs = needs - m.effort
         self._weigh()
 

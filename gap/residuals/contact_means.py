@@ -50,6 +50,7 @@ class Means:
     effort_slope: np.ndarray  # (K, n_v) by a delay of all commands [N/s].
     centre: np.ndarray  # (K,) row of the middle.
     weights: csr_matrix  # (K, n_rows) of the rows at which things are evaluated.
+    whole: csr_matrix  # (K, n_rows) of all rows.
     wrench: np.ndarray  # (K, n_wrench), forces and moments of all sensors
     wrench_var: np.ndarray
     extra: np.ndarray  # (K, n_extra) measured rates and efforts less what they must be.
@@ -122,22 +123,23 @@ class ContactMeans(Touching):
             raise DoesNotFit("no test function fits between changes of contact")
         joined = {
             name: np.concatenate([getattr(p, name) for p in parts])
-            for name in vars(parts[0])
-            if name != "weights"
+            for name, x in vars(parts[0]).items()
+            if not isinstance(x, csr_matrix)
         }
-        weights = csr_matrix(block_diag([p.weights for p in parts], format="csr"))
         columns = np.concatenate(
             [self._offset[p.episode[0]] + np.arange(len(self.tracks[p.episode[0]].time))
              for p in parts]
         )  # fmt: skip
-        whole = csr_matrix(
-            (weights.data, columns[weights.indices], weights.indptr),
-            (weights.shape[0], self._offset[-1]),
-        )
+
+        def of_all(each: list[csr_matrix]) -> csr_matrix:
+            own = csr_matrix(block_diag(each, format="csr"))
+            shape = own.shape[0], self._offset[-1]
+            return csr_matrix((own.data, columns[own.indices], own.indptr), shape)
+
+        joined["weights"] = of_all([p.weights for p in parts])
+        joined["whole"] = of_all([p.whole for p in parts])
         keep = self._kept(joined)
-        return Means(
-            weights=whole[keep], **{name: x[keep] for name, x in joined.items()}
-        )
+        return Means(**{name: x[keep] for name, x in joined.items()})
 
     def _kept(self, joined) -> np.ndarray:
         """Which test functions: where an object moves first, few of the others."""
@@ -178,7 +180,8 @@ class ContactMeans(Touching):
         part = Means(
             np.full(len(centres), number), centres, acceleration, acceleration_var,
             effort, effort_var, slope, self._offset[number] + phi.middle_rows(),
-            phi.nodes(), wrench, wrench_var, extra, extra_var,
+            phi.nodes(), test_functions(track.time, centres, half)[0],
+            wrench, wrench_var, extra, extra_var,
         )  # fmt: skip
         if not full.all():
             part = part.of(full)

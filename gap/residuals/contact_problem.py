@@ -39,6 +39,7 @@ from makebreak.gap.residuals.widened_contacts import (
 from makebreak.gap.residuals.wrench_sensor import felt_motion
 from makebreak.gap.result import Where
 from makebreak.gap.simulation.contact_windows import (
+    LAW,
     PushWindows,
     led_as_measured,
     varies,
@@ -58,7 +59,6 @@ FELT = 0.05  # What a force sensor shows more, sampled amid a drive's ripple too
 BEYOND = 3.0
 MISFIT = 1.15  # Less than so many times the sensors' noise is no misfit.
 (DELAY,) = (name for name, kind in KINDS.items() if kind.channel == "delay")
-LAW = 0.02  # How exact friction, a mass or a gain can be known by laws of contact.
 LEAST_MISFIT = 0.002  # Of the forces in a row: laws are no better than that.
 LESS = 0.85
 EXACT = 4  # Single effects that are fitted for what models are off by.
@@ -500,13 +500,19 @@ class ContactProblem(ContactCandidates, GapProblem):
         """What touches with more points than Drake's point contact makes of it."""
         return lying_on_faces(self)
 
+    def pressed(self) -> list[str]:
+        """Pairs of which windows expect that friction is not known better than LAW."""
+        return []
+
     def outcome(
         self, effects, start: Fitted, end: Fitted, nuisances: Nuisances,
         recordings=None, jobs: int = 1,
     ) -> Outcome | None:  # fmt: skip
         if recordings is not None:
             try:
-                model = PushWindows(self.scene, recordings, lying=self.lying())
+                model = PushWindows(
+                    self.scene, recordings, lying=self.lying(), pairs=self.pressed()
+                )
             except DoesNotFit:  # No window fits in.
                 return None
             held = [True] * len(model.windows)
@@ -519,8 +525,9 @@ class ContactProblem(ContactCandidates, GapProblem):
                 }
                 try:
                     self._windows = PushWindows(
-                        self.scene, self.recordings, episodes, self.lying()
-                    )
+                        self.scene, self.recordings, episodes, self.lying(),
+                        self.pressed(),
+                    )  # fmt: skip
                 except DoesNotFit:
                     return None
             model = self._windows

@@ -5,6 +5,7 @@ it, or if the scene's face was passed. What touches what, and how hard, follow.
 """
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -35,11 +36,15 @@ MOST_SLOTS = 12  # Places of a fixed body at which its distances are kept.
 # Of the squares that a pressing force would take off where the tool is at a face, so
 # much at most is left where it is a little above that face [m].
 GONE, ABOVE = 0.25, 0.05
+# Times softer than the scene has it: a contact that lets a tool in so far is softer,
+# and not elsewhere.
+SOFT = 5.0
 AXES = "xyz"
 
 
 class FeltPlaces(FixedFaces):
-    """The same with `off`, {body: {axis: by how far [m]}} of what is felt elsewhere."""
+    """The same with `off`, {body: {axis: by how far [m]}} of what is felt elsewhere,
+    and `soft`, fixed bodies that let the tool in as far as it is in them."""
 
     # ----- Where it touches
 
@@ -75,7 +80,9 @@ class FeltPlaces(FixedFaces):
                 fixed = {a, b} & self.shapes.anchored
                 return not fixed if body is None else body in fixed
 
-            self._slots_at[key] = self.shapes.slots(poses, REACH, counts)
+            self._slots_at[key] = [
+                _where_forces_act(s) for s in self.shapes.slots(poses, REACH, counts)
+            ]
         return self._slots_at[key]
 
     def _touches(self, slots: Sequence[Slot]) -> list[np.ndarray]:
@@ -123,6 +130,7 @@ class FeltPlaces(FixedFaces):
     def _prepare(self) -> None:
         self.off: dict[int, dict[str, float]] = {}
         self._prepare_contacts()
+        self.soft = self._soft_bodies()
         while (off := self._felt_faces(self.off)) != self.off:
             # A face that is ruled out by what is felt makes no contact that comes or
             # goes: there are more test functions, and others may be felt in them.
@@ -190,12 +198,31 @@ class FeltPlaces(FixedFaces):
                 found[pair] = now | (s.phi < MEETS)
         return found
 
+    def _soft_bodies(self) -> set[int]:
+        """Fixed bodies in which the tool is about as deep as the scene's contact lets
+        it in under the forces that press there: no face of them need be elsewhere."""
+        slots, _ = self._slots(())
+        pressed, met = self._pressing()
+        by_depth: dict[int, float] = {}
+        by_force: dict[int, float] = {}
+        for pair, on in met.items():
+            mine = [s for s in slots if self._pair_of(s) == pair]
+            depth = self._W @ np.maximum(-np.min([s.phi for s in mine], axis=0), 0.0)
+            (body,) = set(pair) & self.shapes.anchored
+            force = mine[0].stiffness * float(depth[on].sum())
+            by_depth[body] = by_depth.get(body, 0.0) + force
+            by_force[body] = by_force.get(body, 0.0) + float(pressed[pair][on].sum())
+        return {k for k, force in by_depth.items() if force < SOFT * by_force[k]}
+
     def _felt_faces(
         self, off: dict[int, dict[str, float]]
     ) -> dict[int, dict[str, float]]:
         """{body: {axis: by how far [m]}} of faces that are off and felt, or passed,
         beside those that are known."""
-        left = [f for f in self.faces if abs(f.off) > SAME]
+        left = [
+            f for f in self.faces
+            if abs(f.off) > SAME and not (f.off < 0.0 and f.body in self.soft)
+        ]  # fmt: skip
         left.sort(key=lambda f: -abs(f.normal @ UP))  # What others stand on first.
         return self._completed(off, left)
 
@@ -394,3 +421,10 @@ class FeltPlaces(FixedFaces):
             for k in {s.a, s.b} & self.shapes.anchored:
                 found[k] = np.minimum(found.get(k, s.phi), s.phi)
         return found
+
+
+def _where_forces_act(s: Slot) -> Slot:
+    """A slot with its place between the two shapes, where one is inside the other: of
+    a soft contact that is not the deepest point, and friction has another lever."""
+    inside = np.maximum(-s.phi, 0.0)[:, None]
+    return replace(s, place=s.place + s.gives * inside * s.normal)

@@ -144,8 +144,14 @@ class PermittedContacts(ContactMeans):
         self._node_v, self._node_v_off = v, self._v_off[self._rows]
         # Where wrenches are measured (n_nodes, 3) [m].
         self._felt_at = [self._places_of(sensor.frame, q) for sensor in self.sensors]
-        # The equations without acceleration at nodes, the mass matrix in the middle.
-        self._still = self._W @ self.dynamics.inverse_dynamics(q, v, np.zeros_like(v))
+        # The equations of the smoothed motion, and the mass matrix in the middle for
+        # what the mean of the acceleration differs from the smoothed one by: where
+        # links turn fast the mean of a product is not that of means.
+        rows = np.unique(m.whole.indices)
+        vd = self._vd[rows]
+        effort = self.dynamics.inverse_dynamics(self._q[rows], self._v[rows], vd)
+        self._needed_smoothed = m.whole[:, rows] @ effort
+        self._mean_vd = m.whole[:, rows] @ vd
         self._M = np.empty((len(m.time), n_v, n_v))
         for k, row in enumerate(m.centre):
             plant.SetPositions(self._context, self._q[row])

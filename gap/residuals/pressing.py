@@ -20,7 +20,7 @@ from makebreak.gap.numerics.selection import Screen, std_of_shared_errors
 from makebreak.gap.problem import Candidate, Fitted, Nuisances
 from makebreak.gap.residuals.contact_dynamics import THIN
 from makebreak.gap.residuals.contact_problem import ContactProblem
-from makebreak.gap.residuals.felt_places import AXES, MOVES, WHOLE, FeltPlaces
+from makebreak.gap.residuals.felt_places import AXES, MOVES, SOFT, WHOLE, FeltPlaces
 from makebreak.gap.residuals.fixed_faces import (
     CLEAR,
     FEWEST_ROWS,
@@ -225,6 +225,8 @@ class PressingProblem(FeltPlaces):
         inside = self._inside(placed)
         before = self._inside(())
         for body, depth in inside.items():
+            if body in self.soft:  # How deep it may be there its distances tell.
+                continue
             more = (depth < -KNOCKED) & ~(before.get(body, depth + 1.0) < -KNOCKED)
             if more.sum() >= FEWEST_ROWS:
                 name = self.shapes.names[body]
@@ -268,7 +270,10 @@ class PressingProblem(FeltPlaces):
             for e in self._softened:
                 if self._at_pair(e, pair):
                     stiffness = e.parameters["stiffness"]
-                    if not stiffness * PASSED > pressed[on].max():
+                    least = pressed[on].max() / PASSED
+                    if set(pair) & self.soft:
+                        least = min(least, mine[0].stiffness / SOFT)
+                    if not stiffness > least:
                         # Softer, and with one parameter it would explain a wall that
                         # stands elsewhere.
                         raise ValueError("contact_stiffness: a tool goes in too far")
@@ -378,7 +383,9 @@ class PressingProblem(FeltPlaces):
             for X in whole
         )
         if is_enough:
-            found = [c for c in found if c.kind != "contact_stiffness"]
+            # Where the scene's contact is as soft, a stiffness is as likely as a place.
+            soft = {self.pair_name(p) for p in self._met if set(p) & self.soft}
+            found = [c for c in found if c.kind != STIFFNESS or set(c.at) & soft]
         return found, is_enough
 
     def _plain_candidates(self, r: np.ndarray, there: Sequence[Effect]):
@@ -475,6 +482,9 @@ class PressingProblem(FeltPlaces):
                 continue
             found.append((Effect(STIFFNESS, [at], now), MOVES))
         return found
+
+    def pressed(self) -> list[str]:
+        return [self.pair_name(pair) for pair in self._met]
 
     def _touched_axes(self) -> dict[int, dict[str, float]]:
         """{fixed body: {axis along which it is felt: how far it is off there [m]}}."""

@@ -179,7 +179,8 @@ class Slot:
 
     phi (n,) distance [m]; normal (n, 3) from b to a; place (n, 3), both in world;
     best (n,): no other surface that faces alike is nearer to the point.
-    friction, stiffness [N/m] of the two together.
+    friction, stiffness [N/m] of the two together. gives: of the depth, the share by
+    which the shape of a gives, the softer the more; that of b gives the rest.
     """
 
     a: int
@@ -191,6 +192,7 @@ class Slot:
     best: np.ndarray
     friction: float
     stiffness: float
+    gives: float = 0.5
 
 
 class ContactShapes:
@@ -416,6 +418,7 @@ class ContactShapes:
                         point.body, s.body, (i, j), phi, n,
                         c - point.radius * n, best, _pair(point.friction, s.friction),
                         _in_row(point.stiffness, s.stiffness),
+                        _gives(point.stiffness, s.stiffness),
                     )
                 )  # fmt: skip
         return found + self._crossings(poses, near, counts)
@@ -510,6 +513,13 @@ def _pair(a: float, b: float) -> float:
 def _in_row(a: float, b: float) -> float:
     finite = [k for k in (a, b) if np.isfinite(k)]
     return 1.0 / sum(1.0 / k for k in finite) if finite else 1e6
+
+
+def _gives(a: float, b: float) -> float:
+    """Of the depth of two stiffnesses [N/m], the share of the first."""
+    if np.isinf(b):
+        return 0.5 if np.isinf(a) else 1.0
+    return 0.0 if np.isinf(a) else b / (a + b)
 
 
 def poses_of(plant: MultibodyPlant, q: np.ndarray, shapes: ContactShapes):

@@ -22,6 +22,7 @@ from makebreak.gap.simulation.face_supports import LiesOn, add_supports
 from makebreak.gap.simulation.scene_simulation import SceneSimulation
 from makebreak.gap.simulation.windows import TURN, Window, WindowModel
 from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.effects.contact import FRICTION
 from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
 from makebreak.models.scene import Scene
 from makebreak.models.scene_schema import COMMANDS_OF, ActuationSection
@@ -38,6 +39,7 @@ APART = 5e-3  # What is so far from all that could push it is left alone [m],
 GOES, SEEMS = 3e-3, 4.0  # It is pushed if it goes so far [m], times its noise.
 SEEN_APART, COMES_SEC = 0.02, 0.2  # asked every so often, and no longer before a push.
 DRAWS = 3  # Of uncertain starts.
+LAW = 0.02  # How exact friction, a mass or a gain can be known by laws of contact.
 # Laws of contact are approximations: of how far an object moves, and a driven joint.
 BLUR, BLUR_DRIVEN = 0.005, 0.0005
 MOST = 4
@@ -47,7 +49,8 @@ LED_RATE, LED_SEC = 300.0, 1e-3
 
 class PushWindows(WindowModel):
     """Args: episodes: (recording, number) of those that count, else all. lying: bodies
-    that lie on faces, which are carried by face_supports.
+    that lie on faces, which are carried by face_supports. pairs: those of which windows
+    expect no friction to be known better than LAW.
 
     Raises: DoesNotFit where no window fits in.
     """
@@ -58,8 +61,9 @@ class PushWindows(WindowModel):
         recordings: Sequence[Recording],
         episodes: set[tuple[int, int]] | None = None,
         lying: Sequence[LiesOn] = (),
+        pairs: Sequence[str] = (),
     ):
-        self._only = episodes
+        self._only, self._pairs = episodes, tuple(pairs)
         self._shapes: ContactShapes | None = None
         scene, led = led_as_measured(scene, recordings)
         self._led = led
@@ -225,21 +229,38 @@ class PushWindows(WindowModel):
         return other
 
     def _spread(self, effects: Sequence[Effect]):
-        """Of each window what it does, and the variance that uncertain starts make."""
+        """Of each window what it does, and the variance that uncertain starts make, and
+        frictions that are off by LAW: an arm that pushes along a wall may stick or slip
+        by them, and where it does not hold itself a little becomes much."""
         rng = np.random.default_rng(0)
         plain = self.simulate(effects)
         wide = [np.zeros_like(y) for y in plain]
+
+        def add(other: Sequence[np.ndarray], share: float) -> None:
+            for total, y, y0 in zip(wide, other, plain, strict=True):
+                off = np.minimum((y - y0) ** 2, 1.0)
+                total += np.where(np.isfinite(off), off, 1.0) * share
+
         kept = self.windows
         try:
             for _ in range(DRAWS):
                 self.windows = [_drawn(w, rng) for w in kept]
-                drawn = self.simulate(effects)
-                for total, y, y0 in zip(wide, drawn, plain, strict=True):
-                    off = np.minimum((y - y0) ** 2, 1.0)
-                    total += np.where(np.isfinite(off), off, 1.0) / DRAWS
+                add(self.simulate(effects), 1.0 / DRAWS)
         finally:
             self.windows = kept
+        for by in (LAW, -LAW) if self._pairs else ():
+            add(self.simulate(self._with_frictions(effects, 1.0 + by)), 0.5)
         return plain, wide
+
+    def _with_frictions(self, effects: Sequence[Effect], by: float) -> list[Effect]:
+        """The effects, with frictions of pairs times so much."""
+        others = [e for e in effects if e.kind != FRICTION]
+        now = {pair: self.dynamics.now(FRICTION, [pair]) for pair in self._pairs}
+        now |= {at: e.parameters for e in effects if e.kind == FRICTION for at in e.at}
+        return others + [
+            Effect(FRICTION, [pair], {name: by * x for name, x in p.items()})
+            for pair, p in now.items()
+        ]
 
     def _add_spread(self) -> None:
         """Noise, what uncertain starts do in the scene as it is, and a share

@@ -110,7 +110,7 @@ def _values_now(effect: Effect, plant: MultibodyPlant, scene_graph) -> dict[str,
             for body in (a, b)
         )
 
-    if effect.kind == "contact_friction":
+    if effect.kind == FRICTION:
         mu1 = friction_against(effect, plant, scene_graph, a, b)
         mu2 = friction_against(effect, plant, scene_graph, b, a)
         return {"friction": combined_friction(mu1, mu2)}
@@ -140,7 +140,7 @@ def _add_damper(
 ) -> OutputPort:
     stiffness, friction = (
         _values_now(Effect(kind, effect.at, {}), plant, scene_graph)[name]
-        for kind, name in ((STIFFNESS, "stiffness"), ("contact_friction", "friction"))
+        for kind, name in ((STIFFNESS, "stiffness"), (FRICTION, "friction"))
     )
     damper = builder.AddNamedSystem(
         f"contact_damper_{effect.at[0].replace('.', '_').replace('~', '_')}",
@@ -158,11 +158,12 @@ def _add_damper(
 
 
 # Kinds that set the normal force of a contact.
+FRICTION = "contact_friction"
 CONTACT_LAW = (STIFFNESS, DISSIPATION) = ("contact_stiffness", "contact_dissipation")
 DAMPER = "contact_damping"  # A linear damper instead of the dissipation.
 
 KINDS = {
-    "contact_friction": EffectKind(
+    FRICTION: EffectKind(
         at="pair",
         # Data of sticking contact only bound it from below: a fit ends at `high`.
         parameters=(
@@ -188,9 +189,9 @@ KINDS = {
         ),
         says="where x is {x_min} to {x_max} and y is {y_min} to {y_max}, the friction "
         "coefficient of {at} is {friction}",
-        confused_with=("contact_friction", "plane_tilt"),
+        confused_with=(FRICTION, "plane_tilt"),
         tell_apart="slide over the place in another direction, and beside it",
-        contains=("contact_friction",),  # A patch under the whole path.
+        contains=(FRICTION,),  # A patch under the whole path.
         rank=1,
         before_finalize=cut_patch,
         now=patch_values,
@@ -218,7 +219,7 @@ KINDS = {
         at="pair",
         parameters=(Parameter("dissipation", "s/m", 0.0, 100.0, None, valid=">= 0"),),
         says="the contact of {at} has a dissipation of {dissipation}",
-        confused_with=("contact_stiffness", "contact_friction", "corner_radius"),
+        confused_with=("contact_stiffness", FRICTION, "corner_radius"),
         tell_apart="let it hit at two speeds",
         rank=1,
         before_finalize=_set_dissipation,
