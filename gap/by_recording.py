@@ -2,7 +2,9 @@
 
 One value for all recordings explains none of them where they differ: a load that was
 taken up between two of them, or a joint that was warm in one. Each recording is then
-searched by itself, and what was found in one is fitted in the others.
+searched by itself, and what was found in one is fitted in the others. Effects are named
+only if each is explained by itself: once one is not, others are searched no more,
+unless a single effect would explain half of what one of them leaves.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -12,7 +14,7 @@ import numpy as np
 
 from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.fit import fit_effects
-from makebreak.gap.problem import GapProblem, is_sane
+from makebreak.gap.problem import GapProblem, is_sane, rms
 from makebreak.gap.result import (
     Differs,
     Estimate,
@@ -23,7 +25,7 @@ from makebreak.gap.result import (
 )
 from makebreak.gap.search.choice import Selection
 from makebreak.gap.search.trust import by_recording
-from makebreak.gap.thresholds import DIFFERS_SHARE, DIFFERS_Z
+from makebreak.gap.thresholds import CLOSED_SHARE_MIN, DIFFERS_SHARE, DIFFERS_Z
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, with_deviation
 
@@ -43,6 +45,69 @@ class Alone:
     result: GapResult
 
 
+@dataclass(frozen=True, eq=False)
+class Together:
+    """What all recordings come to together, and what that says of each."""
+
+    problem: GapProblem
+    selection: Selection
+
+    @property
+    def names(self) -> list[str]:
+        return list(dict.fromkeys(r.name for r in self.problem.recordings))
+
+    def left(self) -> dict[str, float]:
+        """{recording: rms of what its held-out rows leave}."""
+        return {n: rms(self.selection.end.left[on]) for n, on in self._held().items()}
+
+    def with_one_of_their_own(self) -> set[str]:
+        """Recordings of which one candidate, with a value for each recording, would
+        explain half, to first order, that it does not with the same value for all."""
+        end, nuisances = self.selection.end, self.selection.nuisances
+        screen, held = self.selection.screen(self.problem), self._held()
+        of_row = self._of_row()
+
+        def left(columns: np.ndarray) -> dict[str, float]:
+            fit = screen.fit(columns)
+            r = end.r - columns @ fit.c - nuisances.columns @ fit.b
+            return {name: rms(r[on]) for name, on in held.items()}
+
+        now = left(np.zeros((len(end.r), 0)))
+        found = set()
+        for c in self.problem.candidates(nuisances, end):
+            for X in c.columns if not c.members else ():
+                same = left(X)
+                own = left(np.hstack([X * (of_row == n)[:, None] for n in self.names]))
+                found |= {
+                    n for n in held
+                    if own[n] < (1.0 - CLOSED_SHARE_MIN) * min(now[n], same[n])
+                }  # fmt: skip
+        return found
+
+    def values(self, name: str) -> dict[Key, dict[str, tuple[float, float]]]:
+        """{(kind, place): {parameter: (value, deviation)}} in one of the recordings, to
+        first order."""
+        end = self.selection.end
+        found: dict[Key, dict[str, tuple[float, float]]] = {}
+        for (i, parameter), of in by_recording(self.problem, end).items():
+            if name in of:
+                found.setdefault(_key(end.effects[i]), {})[parameter] = of[name]
+        return found
+
+    def _of_row(self) -> np.ndarray:
+        """(m,) the name of the recording of each row."""
+        return np.array([r.name for r in self.problem.recordings])[self.problem.parts()]
+
+    def _held(self) -> dict[str, np.ndarray]:
+        """{recording: (m,) its rows that are held out; all where none is}."""
+        of_row, train = self._of_row(), self.problem.train()
+        found = {}
+        for name in self.names:
+            mine = of_row == name
+            found[name] = mine & ~train if (mine & ~train).any() else mine
+        return found
+
+
 def may_differ(problem: GapProblem, fitted, result: GapResult) -> bool:
     """Whether recordings should be looked at one by one: they leave a gap together, or
     an effect, to first order, is another in each."""
@@ -58,16 +123,17 @@ def may_differ(problem: GapProblem, fitted, result: GapResult) -> bool:
 
 
 def with_differences(
-    result: GapResult, names: Sequence[str], alone: Callable[[str], Alone]
+    result: GapResult, shared: Together, alone: Callable[[str], Alone]
 ) -> GapResult:
     """The result of all recordings together, corrected by what each is by itself.
 
     Effects that differ are named for the recordings in which they are, if each
     recording by itself is explained; otherwise the result says only that they differ.
 
-    Args: names: of the recordings. alone: judges one of them; DoesNotFit where it
-        is too short by itself.
+    Args: shared: what recordings come to together. alone: judges one of them;
+        DoesNotFit where it is too short by itself.
     """
+    names = shared.names
     if len(names) > MOST_RECORDINGS:
         more = (
             f" Whether the {len(names)} recordings differ was not asked: give at most "
@@ -75,12 +141,20 @@ def with_differences(
         )
         return replace(result, says=result.says + more)
     try:
-        each = [alone(name) for name in names]
+        each = _searched(shared, alone)
     except DoesNotFit:
         return result
     told = [one for one in each if one.result.verdict in EXPLAINED]
     found = _found([one.result for one in told] + [result])
     together = {one.name: _together(one, result) for one in each if one not in told}
+    if left_out := [n for n in names if n not in {one.name for one in each}]:
+        together |= {name: shared.values(name) for name in left_out}
+        is_not = next(one.name for one in each if one not in told)
+        result = replace(
+            result,
+            says=f"{result.says} Not searched separately, since {is_not} is not "
+            f"explained by itself either: {', '.join(left_out)}.",
+        )
     values = {key: _values(effect, told, together) for key, effect in found.items()}
     differs = {
         key: d for key, effect in found.items()
@@ -89,7 +163,7 @@ def with_differences(
     if not differs:
         return result
     words = " ".join(d.says for d in differs.values())
-    if len(told) < len(each):
+    if len(told) < len(names):
         return replace(
             result, says=f"{result.says} {words}", differs=tuple(differs.values())
         )
@@ -112,6 +186,22 @@ def with_differences(
         nuisance_scene=(),
         differs=tuple(differs.values()),
     )
+
+
+def _searched(shared: Together, alone: Callable[[str], Alone]) -> list[Alone]:
+    """Recordings by themselves, in their order. The one that leaves most comes first.
+    Once one is not explained effects are not named for recordings, and only those are
+    searched that have an effect of their own."""
+    left = shared.left()
+    found: dict[str, Alone] = {}
+    own: set[str] | None = None
+    for name in sorted(left, key=lambda n: -left[n]):
+        if own is not None and name not in own:
+            continue
+        found[name] = alone(name)
+        if own is None and found[name].result.verdict not in EXPLAINED:
+            own = shared.with_one_of_their_own()
+    return [found[name] for name in shared.names if name in found]
 
 
 def _found(each: Sequence[GapResult]) -> dict[Key, NamedEffect]:
@@ -161,6 +251,8 @@ def _together(one: Alone, result: GapResult):
     """{(kind, place): {parameter: (value, deviation)}} of what was named for all
     recordings, fitted to one of them."""
     start = [e.effect() for e in result.effects]
+    if not start:
+        return {}
     try:
         fit = fit_effects(one.problem, one.selection.screen(one.problem), start)
     except (ValueError, RuntimeError):  # A scene cannot have them.

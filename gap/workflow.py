@@ -8,7 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from makebreak.gap.by_recording import Alone, may_differ, with_differences
+from makebreak.gap.by_recording import (
+    Alone,
+    Together,
+    may_differ,
+    with_differences,
+)
 from makebreak.gap.data import sampled_commands
 from makebreak.gap.data.channel_noise import in_newton_metres
 from makebreak.gap.data.check_drives import (
@@ -164,8 +169,7 @@ def run_gap(
                 name, one, selected, conclude(one, selected, its, checks, jobs)
             )
 
-        names = list(dict.fromkeys(r.name for r in decided))
-        result = with_differences(result, names, alone)
+        result = with_differences(result, Together(problem, selection), alone)
         seconds["recordings"] = clock.lap()
     return unless_doubtful(result).with_seconds(seconds)
 

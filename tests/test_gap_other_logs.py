@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from makebreak.gap import read_recordings, run_gap, write_report
-from makebreak.gap.by_recording import _apart, with_differences
+from makebreak.gap.by_recording import Alone, Together, _apart, with_differences
 from makebreak.gap.data import sampled_commands
 from makebreak.gap.data.conditioning import condition
 from makebreak.gap.data.findings import GUESSED_GAINS, NO_COLUMN, NO_DRIVE, Finding
@@ -20,7 +20,10 @@ from makebreak.gap.residuals.inverse import InverseModel
 from makebreak.gap.residuals.mechanism import MechanismProblem
 from makebreak.gap.residuals.mechanism_candidates import nuisances
 from makebreak.gap.result import Evidence, GapMeasure, GapResult, NamedEffect
+from makebreak.gap.search.choice import Selection
+from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.search.groups import _needless_member
+from makebreak.gap.search.select import select
 from makebreak.gap.workflow import _follows_noise
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import read_scene
@@ -305,9 +308,63 @@ def test_only_a_recording_that_is_too_short_is_not_searched_alone():
     def wrong(name):
         raise ValueError("operands could not be broadcast")
 
-    assert with_differences(result, ["a", "b"], short) is result
+    both = shared(left={"a": 2.0, "b": 1.0})
+    assert with_differences(result, both, short) is result
     with pytest.raises(ValueError, match="broadcast"):
-        with_differences(result, ["a", "b"], wrong)
+        with_differences(result, both, wrong)
+
+
+def shared(left, own=()):
+    """As Together, of recordings that leave so much, some with effects of their own."""
+    return SimpleNamespace(
+        names=sorted(left), left=lambda: left, values=lambda name: {},
+        with_one_of_their_own=lambda: set(own),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "unexplained, own, searched",
+    [("", (), "cbad"), ("c", (), "c"), ("b", (), "cb"), ("c", ("a", "d"), "cad")],
+)
+def test_once_a_recording_is_not_explained_only_some_are_searched(
+    unexplained, own, searched
+):
+    gap = GapMeasure(9.0, 9.0, 1.0, 0.3)
+    result = GapResult("gap_unnamed", "All.", (), [], gap, (), {}, [])
+    asked = []
+
+    def alone(name):
+        asked.append(name)
+        verdict = "gap_unnamed" if name == unexplained else "no_gap"
+        its = GapResult(verdict, "", (), [], gap, (), {}, [])
+        return Alone(name, None, None, its)
+
+    four = shared({"a": 2.0, "b": 3.0, "c": 4.0, "d": 1.0}, own)
+    out = with_differences(result, four, alone)
+    assert "".join(asked) == searched
+    rest = ", ".join(sorted(set("abcd") - set(searched)))
+    said = f"since {unexplained} is not explained by itself either: {rest}."
+    assert out.says == "All." + f" Not searched separately, {said}" * bool(rest)
+
+
+@pytest.mark.parametrize("cold, own", [(0.0, {"warm"}), (0.5, set())])
+def test_a_recording_that_an_effect_of_its_own_would_explain_is_told(
+    scene, tmp_path, cold, own
+):
+    """Not if the same value explains both."""
+    paths = [log(tmp_path, "cold", 3, cold), log(tmp_path, "warm", 4, damping=0.5)]
+    problem = MechanismProblem(read_scene(scene), read_recordings(paths))
+    start = Comparison(problem, print).start
+    nothing = Selection((), start, start, problem.nuisances())
+    both = Together(problem, nothing)
+    assert both.names == ["cold", "warm"]
+    left = both.left()
+    assert left["warm"] > 3.0 and (left["cold"] < 2.0) == (cold == 0.0)
+    assert both.with_one_of_their_own() == own
+    there = Together(problem, select(problem, lambda text: None))
+    values = there.values("warm")["joint_viscous_damping", ("rig.hinge",)]
+    value, std = values["damping"]
+    assert value == pytest.approx(0.5, abs=max(5.0 * std, 0.02))
 
 
 def test_an_effect_in_one_of_two_recordings_is_named_for_that_one(scene, tmp_path):
