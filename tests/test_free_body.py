@@ -11,9 +11,13 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.geometry import Box, Cylinder
 from pydrake.math import RotationMatrix
 
+from makebreak.gap.data.conditioning import condition
+from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.numerics.free_body import lowest_gap, simulate
+from makebreak.gap.residuals.contact import _trials
 from makebreak.gap.simulation.face_supports import centres_of, within_faces
 from makebreak.gap.simulation.free_body import REST_DEPTH, FreeBodyScene
+from makebreak.gap.simulation.free_windows import FreeBodyModel
 from makebreak.gap.simulation.scene_simulation import SceneSimulation, SimulationConfig
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import InitialSection, read_scene
@@ -205,16 +209,19 @@ def test_a_box_lands_on_corners_as_sharp_as_it_has(scene, tmp_path):
     np.testing.assert_allclose(gap, 0.2 + lowest, atol=1e-5)
 
 
-def with_puck(scene, folder, friction: float):
+def with_puck(scene, folder, friction: float, of_wall: float | None = None):
     """The scene with a cylinder in the place of the cube, and a wall at x = 0.5."""
-    surface = (
-        '<drake:proximity_properties xmlns:drake="drake.mit.edu">'
-        f"<drake:mu_static>{friction}</drake:mu_static>"
-        f"<drake:mu_dynamic>{friction}</drake:mu_dynamic>"
-        "<drake:point_contact_stiffness>60000</drake:point_contact_stiffness>"
-        "<drake:hunt_crossley_dissipation>0.5</drake:hunt_crossley_dissipation>"
-        "</drake:proximity_properties>"
-    )
+
+    def surface(mu: float) -> str:
+        return (
+            '<drake:proximity_properties xmlns:drake="drake.mit.edu">'
+            f"<drake:mu_static>{mu}</drake:mu_static>"
+            f"<drake:mu_dynamic>{mu}</drake:mu_dynamic>"
+            "<drake:point_contact_stiffness>60000</drake:point_contact_stiffness>"
+            "<drake:hunt_crossley_dissipation>0.5</drake:hunt_crossley_dissipation>"
+            "</drake:proximity_properties>"
+        )
+
     shapes = {
         "puck": "<cylinder><radius>0.04</radius><length>0.02</length></cylinder>",
         "wall": "<box><size>0.2 2 2</size></box>",
@@ -225,12 +232,13 @@ def with_puck(scene, folder, friction: float):
     )
     directives = list(scene.directives[:-1])
     for name, shape in shapes.items():
+        mu = friction if name == "puck" or of_wall is None else of_wall
         place = '<pose relative_to="__model__">0.6 0 0 0 0 0</pose>' * (name == "wall")
         (folder / f"{name}.sdf").write_text(
             f'<sdf version="1.9"><model name="{name}"><static>{name == "wall"}</static>'
             f'<link name="{name}">{place}{inertial * (name == "puck")}'
-            f'<collision name="c"><geometry>{shape}</geometry>{surface}</collision>'
-            "</link></model></sdf>"
+            f'<collision name="c"><geometry>{shape}</geometry>{surface(mu)}'
+            "</collision></link></model></sdf>"
         )
         more = copy.deepcopy(scene.directives[-1])
         more.add_model.name, more.add_model.file = name, f"file://{folder}/{name}.sdf"
@@ -255,3 +263,41 @@ def test_a_round_puck_meets_a_wall_as_a_circle_does(scene, tmp_path, yaw):
         # The point of contact is a little within the rim: by half of 2 mm of 40.
         want = -0.04 * 0.3 * change / 2.4e-4
         np.testing.assert_allclose(x[7:10], [0.0, 0.0, want], rtol=0.05, atol=1e-3)
+
+
+def test_only_what_is_never_hit_is_eased(scene, tmp_path):
+    numbers = FreeBodyScene(with_puck(scene, tmp_path, 0.1))
+    stiff = numbers.body().pairs[:, :, 0]
+    numbers.ease(np.array([True, False]))
+    eased = numbers.body().pairs[:, :, 0]
+    np.testing.assert_array_equal(eased[:, 1], stiff[:, 1])
+    assert eased[:, 0].max() < 0.5 * stiff[:, 0].max()
+
+
+def test_a_walls_friction_is_not_tried_where_it_would_change_the_grounds(
+    scene, tmp_path
+):
+    """Twice what the puck's surface has is out of reach of the wall's: both become as
+    rough, and the puck on the ground, too."""
+    two = with_puck(scene, tmp_path, 0.1, of_wall=0.4)
+    body = FreeBodyScene(two).body()
+    top = body.fixed[0, 11] + body.fixed[0, 14] + 0.01
+    rng, rows = np.random.default_rng(0), []
+    times = np.arange(0.0, 0.8, 0.01)
+    for episode in range(3):
+        speed = rng.uniform(0.8, 1.2)
+        start = np.array([1.0, 0, 0, 0, 0.2, 0, top, 0, 0, 0, speed, 0.1, 0.0])
+        x = simulate(body, start, times)[:, :7]
+        x[:, 4:] += 3e-4 * rng.normal(size=(len(x), 3))
+        x[:, :4] += 1e-3 * rng.normal(size=(len(x), 4))
+        stamp = times + 2.0 * episode
+        rows.append(np.column_stack([np.full(len(x), episode), stamp, x]))
+    names = [f"puck.puck.{n}" for n in "qw qx qy qz x y z".split()]
+    header = ",".join(["episode", "time", *names])
+    log = tmp_path / "log.csv"
+    np.savetxt(log, np.concatenate(rows), delimiter=",", header=header, comments="")
+    recordings, _ = condition(read_recordings([log]), False)
+    model = FreeBodyModel(two, recordings)
+    at = "puck.puck~wall.wall"
+    ((tried, _, _),) = _trials(model, "contact_friction", at)
+    assert [f"{t[0][1]['friction']:.3g}" for t in tried] == ["0.08", "0.144"]

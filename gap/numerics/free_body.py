@@ -148,6 +148,17 @@ def lowest_gap(body: FreeBody, pose) -> float:
     return nearest(body, pose)[0]
 
 
+def gaps(body: FreeBody, pose) -> np.ndarray:
+    """(m,) least distance of a sphere to each fixed shape [m]; pose (7,)."""
+    R, p = _matrix(np.asarray(pose[:4], float)), np.asarray(pose[4:7], float)
+    centres = p + body.spheres[:, :3] @ R.T
+    each = [
+        [_gap(c[0], c[1], c[2], r, fixed)[0] for fixed in body.fixed]
+        for c, r in zip(centres, body.spheres[:, 3], strict=True)
+    ]
+    return np.array(each).min(axis=0)
+
+
 def nearest(body: FreeBody, pose) -> tuple[float, np.ndarray, int]:
     """Least distance of a sphere to what is fixed [m], the normal there (3,), out of
     what is fixed, and which of the fixed shapes it is (-1: there is none)."""
@@ -156,9 +167,9 @@ def nearest(body: FreeBody, pose) -> tuple[float, np.ndarray, int]:
     for sphere in body.spheres:
         c = p + R @ sphere[:3]
         for k, each in enumerate(body.fixed):
-            gap, n = _gap(c, sphere[3], each)
+            gap, *n = _gap(c[0], c[1], c[2], sphere[3], each)
             if gap < found[0]:
-                found = (float(gap), n, k)
+                found = (float(gap), np.array(n), k)
     return found
 
 
@@ -191,17 +202,15 @@ def _is_apart(c0, c1, c2, radius, fixed):
 
 
 @njit(cache=True)
-def _gap(c, radius, fixed):
-    """Distance of a sphere at c to a fixed shape, and the normal out of the shape."""
-    d0, d1, d2 = c[0] - fixed[9], c[1] - fixed[10], c[2] - fixed[11]
-    n = np.empty(3)
+def _gap(c0, c1, c2, radius, fixed):
+    """Distance of a sphere to a fixed shape, and the normal (3) out of the shape."""
+    d0, d1, d2 = c0 - fixed[9], c1 - fixed[10], c2 - fixed[11]
     # In the shape's axes.
     a0 = fixed[0] * d0 + fixed[3] * d1 + fixed[6] * d2
     a1 = fixed[1] * d0 + fixed[4] * d1 + fixed[7] * d2
     a2 = fixed[2] * d0 + fixed[5] * d1 + fixed[8] * d2
     if fixed[12] < 0.0:
-        n[0], n[1], n[2] = fixed[2], fixed[5], fixed[8]
-        return a2 - radius, n
+        return a2 - radius, fixed[2], fixed[5], fixed[8]
     h0, h1, h2 = fixed[12], fixed[13], fixed[14]
     o0 = a0 - min(max(a0, -h0), h0)
     o1 = a1 - min(max(a1, -h1), h1)
@@ -218,9 +227,10 @@ def _gap(c, radius, fixed):
             l1, gap = (1.0 if a1 >= 0 else -1.0), -e1
         else:
             l0, gap = (1.0 if a0 >= 0 else -1.0), -e0
-    for i in range(3):
-        n[i] = fixed[3 * i] * l0 + fixed[3 * i + 1] * l1 + fixed[3 * i + 2] * l2
-    return gap - radius, n
+    n0 = fixed[0] * l0 + fixed[1] * l1 + fixed[2] * l2
+    n1 = fixed[3] * l0 + fixed[4] * l1 + fixed[5] * l2
+    n2 = fixed[6] * l0 + fixed[7] * l1 + fixed[8] * l2
+    return gap - radius, n0, n1, n2
 
 
 @njit(cache=True)
@@ -323,7 +333,7 @@ def _rate(t, s, mass, com, inertia, inverse, gravity, spheres, owner, fixed, pai
             T[b, i] = -drag[b, 1] * s[b, 7 + i]
         _push(F, T, b, o[b, 0], o[b, 1], o[b, 2], f[b, 0], f[b, 1], f[b, 2])
     c = np.empty((len(spheres), 3))
-    axis, at = np.empty(3), np.empty(3)
+    axis = np.empty(3)
     b, R = -1, turned[0]
     for j in range(len(spheres)):
         if owner[j] != b:
@@ -342,13 +352,13 @@ def _rate(t, s, mass, com, inertia, inverse, gravity, spheres, owner, fixed, pai
             p0, p1, p2, share_of = c[j, 0], c[j, 1], c[j, 2], 1.0
             if _is_apart(p0, p1, p2, radius + rims[j, 3], fixed[m]):
                 continue
-            gap, n = _gap(c[j], radius, fixed[m])
+            gap, n0, n1, n2 = _gap(p0, p1, p2, radius, fixed[m])
             if what > 0.0:
                 for i in range(3):
                     axis[i] = 0.0
                     for k in range(3):
                         axis[i] += R[i, k] * rims[j, k]
-                along = n[0] * axis[0] + n[1] * axis[1] + n[2] * axis[2]
+                along = n0 * axis[0] + n1 * axis[1] + n2 * axis[2]
                 lean = np.sqrt(max(1.0 - along * along, 0.0))
                 x = min(max((lean - LEAN[0]) / (LEAN[1] - LEAN[0]), 0.0), 1.0)
                 x *= x * (3.0 - 2.0 * x)
@@ -358,30 +368,29 @@ def _rate(t, s, mass, com, inertia, inverse, gravity, spheres, owner, fixed, pai
                 if what == EDGE:
                     share_of *= 0.5 + 0.5 * min(abs(along) / SIDE, 1.0)
                     far = rims[j, 3] / lean
-                    p0 -= far * (n[0] - along * axis[0])
-                    p1 -= far * (n[1] - along * axis[1])
-                    p2 -= far * (n[2] - along * axis[2])
-                    at[0], at[1], at[2] = p0, p1, p2
-                    gap, n = _gap(at, radius, fixed[m])
+                    p0 -= far * (n0 - along * axis[0])
+                    p1 -= far * (n1 - along * axis[1])
+                    p2 -= far * (n2 - along * axis[2])
+                    gap, n0, n1, n2 = _gap(p0, p1, p2, radius, fixed[m])
             if gap >= 0.0:
                 continue
             depth = -gap
             reach = radius - (1.0 - pairs[j, m, 4]) * depth
-            a0 = p0 - s[b, 4] - reach * n[0]
-            a1 = p1 - s[b, 5] - reach * n[1]
-            a2 = p2 - s[b, 6] - reach * n[2]
+            a0 = p0 - s[b, 4] - reach * n0
+            a1 = p1 - s[b, 5] - reach * n1
+            a2 = p2 - s[b, 6] - reach * n2
             u0 = s[b, 10] + w1 * a2 - w2 * a1
             u1 = s[b, 11] + w2 * a0 - w0 * a2
             u2 = s[b, 12] + w0 * a1 - w1 * a0
-            un = u0 * n[0] + u1 * n[1] + u2 * n[2]
+            un = u0 * n0 + u1 * n1 + u2 * n2
             fn = pairs[j, m, 0] * depth * (1.0 - pairs[j, m, 1] * un)
             fn -= pairs[j, m, 5] * un
             fn *= share_of
             if fn <= 0.0:
                 continue
-            u0 -= un * n[0]
-            u1 -= un * n[1]
-            u2 -= un * n[2]
+            u0 -= un * n0
+            u1 -= un * n1
+            u2 -= un * n2
             speed = np.sqrt(u0 * u0 + u1 * u1 + u2 * u2)
             share = 0.0
             if speed > 1e-14:
@@ -396,13 +405,13 @@ def _rate(t, s, mass, com, inertia, inverse, gravity, spheres, owner, fixed, pai
                         mu_s = mu_d = patches[k, 1]
                 mu = _friction(speed, slip, mu_s, mu_d)
                 share = mu * fn / speed
-            f0 = fn * n[0] - share * u0
-            f1 = fn * n[1] - share * u1
-            f2 = fn * n[2] - share * u2
+            f0 = fn * n0 - share * u0
+            f1 = fn * n1 - share * u1
+            f2 = fn * n2 - share * u2
             _push(F, T, b, a0, a1, a2, f0, f1, f2)
             if levers[j, m] > 0.0:
-                wn = w0 * n[0] + w1 * n[1] + w2 * n[2]
-                t0, t1, t2 = w0 - wn * n[0], w1 - wn * n[1], w2 - wn * n[2]
+                wn = w0 * n0 + w1 * n1 + w2 * n2
+                t0, t1, t2 = w0 - wn * n0, w1 - wn * n1, w2 - wn * n2
                 turn = max(np.sqrt(t0 * t0 + t1 * t1 + t2 * t2), fade)
                 T[b, 0] -= levers[j, m] * fn / turn * t0
                 T[b, 1] -= levers[j, m] * fn / turn * t1

@@ -141,10 +141,13 @@ def _trials(model, kind: str, at: str):
         yield [[(c, {"damping": c})] for c in values], ("damping",), ()
     elif kind in _TIMES:
         ((name, value),) = now.items()
-        yield (
-            [[((f - 1.0) * value, {name: f * value})] for f in _TIMES[kind]],
-            (name,), (),
-        )  # fmt: skip
+        offered = [[((f - 1.0) * value, {name: f * value})] for f in _TIMES[kind]]
+        if kind == "contact_friction" and isinstance(model, FreeBodyModel):
+            # Not what also changes others: a wall's would stand for the ground's.
+            offered = [
+                t for t in offered if not model.rubs_others(Effect(kind, [at], t[0][1]))
+            ]
+        yield offered, (name,), ()
     elif kind in _PLUS:
         steps = _PLUS[kind]
         base = {p.name: now.get(p.name, 0.0) for p in KINDS[kind].parameters}

@@ -37,7 +37,8 @@ class FreeBodiesScene:
     """
 
     def __init__(self, scene: Scene, on_side: Sequence[str] = ()):
-        self.scene, self._on_side, self._eased = scene, tuple(on_side), False
+        self.scene, self._on_side = scene, tuple(on_side)
+        self._eased: tuple[np.ndarray, ...] = ()
         loaded, bodies = load_free_bodies(scene)
         plant, inspector = loaded.plant, loaded.scene_graph.model_inspector()
         self.each = [
@@ -71,11 +72,11 @@ class FreeBodiesScene:
         i, j = sorted((self.names.index(a), self.names.index(b)))
         return bool(self._touch[i, j])
 
-    def ease(self) -> None:
+    def ease(self, on: Sequence[np.ndarray]) -> None:
         """FreeBodyScene.ease of each."""
-        self._eased = True
-        for one in self.each:
-            one.ease()
+        self._eased = tuple(on)
+        for one, mine in zip(self.each, on, strict=True):
+            one.ease(mine)
 
     def bodies(
         self, effects: Sequence[Effect] = (), at_corners: float = AT_CORNERS
@@ -90,7 +91,7 @@ class FreeBodiesScene:
             more = replace(self.scene, effects=[*self.scene.effects, *effects])
             other = FreeBodiesScene(more, self._on_side)
             if self._eased:
-                other.ease()
+                other.ease(self._eased)
             return other.bodies((), at_corners)
         numbers = [one.numbers() for one in self.each]
         damper = np.array(self._damper)

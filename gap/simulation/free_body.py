@@ -90,7 +90,8 @@ class FreeBodyScene:
         on_side: bool = False,
         of: tuple[LoadedScene, RigidBody] | None = None,
     ):
-        self.scene, self._on_side, self._eased = scene, on_side, 1.0
+        self.scene, self._on_side = scene, on_side
+        self._eased = np.ones(1)  # Of each fixed shape.
         if of is None:
             loaded, bodies = load_free_bodies(scene)
             if len(bodies) != 1:
@@ -104,13 +105,17 @@ class FreeBodyScene:
         """Whether spheres stand in for its shapes."""
         return bool((self._numbers.role != SPHERE).any())
 
-    def ease(self) -> None:
+    def ease(self, on: np.ndarray | None = None) -> None:
         """Makes faces no stiffer than what lies on them needs to be carried. Of what
-        never hits anything, a stiffness shows nowhere but in how short steps are."""
+        never hits anything, a stiffness shows nowhere but in how short steps are.
+
+        Args: on (m,): on which of the fixed shapes; none: on all.
+        """
         faces = np.isin(self._numbers.role, (CORNER, WITHIN))
-        k = self.body().pairs[faces, :, 0].sum(axis=0).max()
+        k = self.body().pairs[faces, :, 0].sum(axis=0)
         weight = float(self._numbers.mass) * float(np.linalg.norm(self._gravity))
-        self._eased = min(1.0, weight / REST_DEPTH / max(0.5 * k, 1e-9))
+        eased = np.minimum(1.0, weight / REST_DEPTH / np.maximum(0.5 * k, 1e-9))
+        self._eased = eased if on is None else np.where(on, eased, 1.0)
 
     def body(
         self, effects: Sequence[Effect] = (), at_corners: float = AT_CORNERS

@@ -17,6 +17,7 @@ from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.numerics.free_body import (
     FreeBodies,
     FreeBody,
+    gaps,
     lowest_gap,
     nearest,
     placed,
@@ -141,8 +142,12 @@ class FreeBodyModel(WindowedResidual):
         self._curvatures: list[float] = []
         self._falls_freely = True
         self._cut_all()
-        if self.with_faces and not self._is_struck:
-            self._numbers.ease()
+        if self.with_faces:
+            each = zip(self._bodies.each, self.bodies, strict=True)
+            self._numbers.ease(
+                [self._lies_on(body, name) | (not self._is_struck)
+                 for body, name in each]
+            )  # fmt: skip
             self._bodies = self._numbers.bodies()
         if _is_beyond_chance(self._curvatures):
             # Drag, say: a start fitted by gravity alone would be wrong, and the effect
@@ -178,6 +183,27 @@ class FreeBodyModel(WindowedResidual):
     def body(self, at: str) -> FreeBody:
         """The scene's, without further effects, that `at` (a body or a pair) names."""
         return self._bodies.each[self.bodies.index(first_of(self, at))]
+
+    def _lies_on(self, body: FreeBody, name: str) -> np.ndarray:
+        """(m,) on which of the fixed shapes a body lies nearly all the time, so that it
+        never hits them."""
+        poses = np.concatenate([_poses(name, r) for r in self.recordings])
+        near = [gaps(body, pose) < NEAR for pose in poses[:: len(poses) // 500 + 1]]
+        share = np.mean(near, axis=0) if near else np.zeros(len(body.fixed))
+        return share > MOSTLY
+
+    def rubs_others(self, friction: Effect) -> bool:
+        """Whether a friction of a pair is so high that the surfaces of both change, and
+        with them the friction of a body of it with third ones (models/effects/
+        contact.py)."""
+        now, then = self._bodies, self._numbers.bodies([friction])
+        at = self._numbers.each[0].places(friction)
+        ground = self._numbers.each[0].grounds_in(at)
+        return any(
+            not np.allclose(one.pairs[:, ~ground, 3], other.pairs[:, ~ground, 3])
+            for one, other in zip(now.each, then.each, strict=True)
+            if ground.any()
+        )
 
     def _check_apart(self) -> None:
         """Raises: DoesNotFit where two bodies come near each other that would touch
