@@ -505,6 +505,45 @@ def test_blocks_tell_a_gain_of_one_channel_from_chance():
     assert paired_t(one, better, np.ones(n * k, bool), channel) == 0.0
 
 
+def in_touched_blocks(rng, of, size, touched=(1, 4, 9), n=12, rows=60):
+    """What an effect of a size leaves that is seen in some of n held-out blocks alone,
+    without and with what is fitted for it to twice as many other blocks."""
+    block = np.arange(3 * n * rows) // rows
+    train = block % 3 != 1
+    column = rng.normal(size=len(block)) * np.isin(block // 3, touched)
+    one = of * rng.normal(size=len(block)) + size * column
+    fitted = (column[train] @ one[train]) / (column[train] @ column[train])
+    return one, one - fitted * column, train
+
+
+def test_an_effect_that_few_blocks_see_is_sure_if_they_agree():
+    rng = np.random.default_rng(0)
+    one, two, train = in_touched_blocks(rng, 1.0, 3.0)
+    channel = np.zeros(len(one), int)
+    blocks = [k for k in np.unique(np.arange(len(one)) // 60) if k % 3 == 1]
+    ratio = [np.sum(x[60 * k : 60 * k + 60] ** 2) for k in blocks for x in (one, two)]
+    gains = 0.5 * np.log(np.divide(ratio[::2], ratio[1::2]))
+    assert np.sum(gains == 0.0) == 9
+    of_all = gains.mean() / gains.std(ddof=1) * 12**0.5
+    assert of_all < 2.0 < paired_t(one, two, train, channel)
+    # Two blocks say too little, and so do three of which one is worse.
+    other = in_touched_blocks(rng, 1.0, 3.0, (1, 4))
+    assert paired_t(*other, channel) < 2.0
+    worse = np.array(two)
+    worse[60 * blocks[4] : 60 * blocks[4] + 60] *= 4.0
+    assert paired_t(one, worse, train, channel) < 2.0
+
+
+@pytest.mark.parametrize("touched", [range(3), range(6), range(11)])
+def test_few_blocks_are_seldom_sure_of_what_is_not_there(touched):
+    """Of a fit to noise, at most as often as Student's t of all blocks is above 2."""
+    rng = np.random.default_rng(1)
+    of = np.exp(0.5 * rng.normal(size=36)).repeat(60)  # Blocks differ in loudness.
+    trials = [in_touched_blocks(rng, of, 0.0, tuple(touched)) for _ in range(1000)]
+    sure = [paired_t(*each, np.zeros(len(of), int)) > 2.0 for each in trials]
+    assert np.mean(sure) < 0.04
+
+
 def wandering_noise(n, memory, rng):
     """(n,) of unit variance, correlation exp(-lag / memory)."""
     keep = np.exp(-1.0 / memory)
