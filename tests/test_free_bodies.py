@@ -182,6 +182,25 @@ def test_an_unseen_spin_follows_from_how_a_ball_goes_on_to_roll(scene, mu, resis
     np.testing.assert_allclose(late, [0.0, v[-1] / RADII["red"], 0.0], rtol=1e-9)
 
 
+def test_a_ball_that_slides_to_the_end_is_seen_to_by_its_mean_acceleration(scene):
+    """Of a stretch of 0.2 s a camera knows no single acceleration to 1 m/s2. How far it
+    is from rolling is then not known, but which way it slips."""
+    body = FreeBodiesScene(scene).bodies().each[0]
+    times = np.arange(0.0, 0.2, 1.0 / 120.0)
+    x, v, slip = slide(0.14, 0.0, 1.2, 0.0, times, RADII["red"])
+    assert slip[-1] > 0.2
+    place = np.zeros((len(times), 3, 3))
+    place[:, 0] = np.stack([x, v, np.gradient(v, times)], axis=1)
+    place[:, 2, 0] = RADII["red"]
+    std = np.stack([np.full((len(x), 3), 4e-3), np.full((len(x), 3), 0.6)], axis=1)
+    for k in (0, 8):
+        each = rolling(body, times, place, std)[k]
+        assert each.more is not None
+        np.testing.assert_allclose(each.more, [v[k], 0.0, 0.0])
+        spin = each.spin(body, place[k, :, 1], np.array([0.0, 0.0, 1.0]))
+        assert spin[1] < v[k] / RADII["red"] - 10.0
+
+
 def write_collisions(
     folder: Path, scene, effects, episodes: int = 6, columns: str = "x y z"
 ) -> Path:

@@ -70,8 +70,7 @@ def rolling(body: FreeBody, time, place, std) -> Sequence[Rolling]:
         a_roll[k] = kappa / (1.0 + kappa) * g
         off[k] = a - a_roll[k]
         grip[k] = body.pairs[0, ground, 3] * -float(normal @ body.gravity)
-        sure = SURE * float(np.linalg.norm(std[k, 1]))
-        slides[k] = np.linalg.norm(off[k]) > max(LEAST, sure)
+        slides[k] = _exceeds(off[k], LEAST, std[k, 1])
     found = [Rolling()] * n
     for a, b in runs_of(slides):
         ends = b < n and on[b]
@@ -85,7 +84,28 @@ def rolling(body: FreeBody, time, place, std) -> Sequence[Rolling]:
                 more = -float(np.linalg.norm(place[k, :, 1])) / size * off[k]
             rolled = place[last, :, 1] - a_roll[k] * (time[last] - time[k])
             found[k] = Rolling(rolled, std[last, 0], more)
+    # Where no single acceleration is sure, the mean of all that follow may be.
+    last = n - 1
+    for k in range(last):
+        if found[k].rolled is not None or not on[k:].all():
+            continue
+        seconds = time[last] - time[k]
+        mean = (place[last, :, 1] - place[k, :, 1]) / seconds - a_roll[k]
+        size = float(np.linalg.norm(mean))
+        sure = np.linalg.norm(std[[k, last], 0], axis=0) / seconds
+        if _exceeds(mean, max(LEAST, SHARE * grip[k]), sure):
+            more = -float(np.linalg.norm(place[k, :, 1])) / size * mean
+            rolled = place[last, :, 1] - a_roll[k] * seconds
+            found[k] = Rolling(rolled, std[last, 0], more)
     return found
+
+
+def _exceeds(a, least: float, std) -> bool:
+    """Whether an acceleration (3,) is more than `least`, and than SURE deviations of it
+    along itself; std (3,)."""
+    size = float(np.linalg.norm(a))
+    along = float(np.linalg.norm(a * std))  # NaN where the start is too vague.
+    return size > least and size**2 > SURE * along
 
 
 def _kappa(body: FreeBody) -> float:
