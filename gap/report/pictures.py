@@ -262,7 +262,7 @@ def picture_of_trust(result: GapResult) -> Figure | None:
     axes.set_xticks([x for x in ticks if abs(x) <= 1.3 * widest])
     _plain_numbers(axes.xaxis)
     axes.set_xlabel(
-        "difference from the fitted value, in its standard deviations (grey: within 2)",
+        "difference in standard deviations (grey: within 2)",
         fontsize=9,
     )
     axes.legend(
