@@ -40,7 +40,8 @@ _DAMPED = (0.02, 0.06, 0.12, 0.25, 0.5)  # Of critical damping: a linear damper'
 _INERTIAS = (0.97, 1.2)
 # Cells a side of the ground that was touched, in search of a patch; their least size.
 CELLS, LEAST_CELL = 6, 0.01  # [m]
-PATCH_ROUNDS = 12
+# A side is moved by so many steps of so much of a cell, most often so many times.
+PATCH_ROUNDS, PATCH_STEPS, PATCH_REACH = 12, (0.25, 0.05), 20
 # Kinds that an unmeasured force on a mechanism would show as; those of free bodies.
 _OF_BODIES = ("constant_force", "body_drag", "object_mass", "object_com",
               "object_inertia", "length_scale")  # fmt: skip
@@ -232,8 +233,9 @@ def _patches(model, at: str, there, r) -> list[Candidate]:
 
 
 def _patch_search(moved, train, grid, friction: float, corner: np.ndarray):
-    """The patch from which no move of a side by a cell or a half, with another friction
-    or the same, takes off more: simulated, not to first order.
+    """The patch that no other place of one side, with another friction or the same,
+    makes better: simulated, not to first order. As windows cross a side or not, the
+    error has steps and narrow valleys; all places of a side are tried, not the next.
 
     Args: moved(friction, sides): residual or None; grid: of x and of y; corner (4,):
         numbers in it of the sides. Returns: friction, sides.
@@ -251,16 +253,21 @@ def _patch_search(moved, train, grid, friction: float, corner: np.ndarray):
 
     at = np.array(corner, float)
     now = error(friction, at)
-    for reach in (1.0, 0.5):
+    for step in PATCH_STEPS:
         for _ in range(PATCH_ROUNDS):
-            moves = [at, *(at + d * e for e in np.eye(4) for d in (-reach, reach))]
-            trials = [(friction * s, x) for s in (0.83, 1.0, 1.2) for x in moves]
-            del trials[len(moves)]  # Where it is: known.
-            errors = [error(*each) for each in trials]
-            best = int(np.argmin(errors))
-            if not errors[best] < 0.99 * now:
+            before = now
+            for side in np.eye(4):
+                trials = [
+                    (friction * share, at + k * step * side)
+                    for share in (0.9, 1.0, 1.1)
+                    for k in range(-PATCH_REACH, PATCH_REACH + 1)
+                ]
+                errors = [error(*each) for each in trials]
+                best = int(np.argmin(errors))
+                if errors[best] < now:
+                    now, (friction, at) = errors[best], trials[best]
+            if not now < 0.99 * before:
                 break
-            now, (friction, at) = errors[best], trials[best]
     return friction, sides(at)
 
 

@@ -79,7 +79,7 @@ class MechanismProblem(InverseModel, GapProblem):
     def __init__(self, scene: Scene, recordings: Sequence[Recording]):
         super().__init__(scene, recordings)
         self.plan = SearchPlan(
-            evaluations=25, most_effects=6, by_channel=True, loud=LOUD
+            evaluations=25, most_effects=10, by_channel=True, loud=LOUD
         )
         self._found: list[Candidate] | None = None
         self._nuisances: Nuisances | None = None
