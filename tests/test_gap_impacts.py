@@ -14,6 +14,7 @@ from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.fit import fit_effects
 from makebreak.gap.numerics.runs import runs_of
 from makebreak.gap.numerics.selection import Screen
+from makebreak.gap.residuals.felt_places import SOFT
 from makebreak.gap.residuals.fixed_faces import PASSED
 from makebreak.gap.residuals.impacts import (
     FREE_SEC,
@@ -200,17 +201,20 @@ def test_a_wall_that_stands_elsewhere_is_found_by_what_runs_against_it(tmp_path)
     assert np.sqrt(np.mean(end.r**2)) < 1.1 < np.sqrt(np.mean(start.r**2))
 
 
-def test_a_soft_bumper_that_is_struck_is_not_pressed_on(tmp_path):
-    """A strike goes deeper than a tool that presses may be in a face; that the face is
-    elsewhere does not follow, as no touch there lasts."""
+@pytest.mark.parametrize("times", [1.0, 10.0])
+def test_a_soft_bumper_that_is_struck_is_not_pressed_on(tmp_path, times):
+    """A strike goes deeper than a tool that presses may be in a face. It goes so deep
+    by the scene's own softness, or, where the scene is ten times as stiff, as if the
+    face were elsewhere; but no touch there lasts."""
     cart = cart_world.Cart(stiffness=1500.0)
     table, noise = cart_world.record(cart, np.random.default_rng(4), 8.0, 250.0)
-    scene = read_scene(cart_world.write(tmp_path, cart, table, noise))
+    told = replace(cart, stiffness=times * cart.stiffness)
+    scene = read_scene(cart_world.write(tmp_path, told, table, noise))
     recordings = read_recordings([tmp_path / "recording.csv"])
     deep = np.abs(table["cart.rail.position"]).max() - (cart.reach - cart.half)
     assert deep > 2.0 * PASSED
     dynamics = SceneDynamics(scene)
-    assert PressingProblem(scene, recordings).off  # What made it one that is pressed.
+    assert bool(PressingProblem(scene, recordings).off) == (times > SOFT)
     assert not presses(dynamics, recordings)
     problem, _ = problem_for(scene, recordings, dynamics)
     assert isinstance(problem, ImpactProblem)
