@@ -75,7 +75,7 @@ def outcomes(monkeypatch, error):
         _model=lambda: SimpleNamespace(windows=[]), _again=windows
     )
     problem = SimpleNamespace(
-        scene=None, recordings=[], tracks=[], _windows=None, lying=list
+        scene=None, recordings=[], tracks=[], _windows=None, lying=list, pressed=list
     )
     end = SimpleNamespace(b=None)
     names = SimpleNamespace(names=())
