@@ -10,6 +10,7 @@ from gap_benchmark.cart_world import PAIR
 from makebreak.gap.data.pieces import part_of
 from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.data.recording import Episode
+from makebreak.gap.data.table import write_recording
 from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.fit import fit_effects
 from makebreak.gap.numerics.runs import runs_of
@@ -21,6 +22,7 @@ from makebreak.gap.residuals.impacts import (
     MOST_FREE,
     ImpactProblem,
     ImpactWindows,
+    positions,
     runs_against,
 )
 from makebreak.gap.residuals.pressing import PressingProblem, presses
@@ -126,6 +128,19 @@ def test_free_motion_is_judged_between_walls_that_are_near(tmp_path):
     fitted = fit_effects(problem, screen, [start])
     assert fitted.effects[0].parameters["coulomb"] == pytest.approx(0.4, rel=0.02)
     assert fitted.std[0]["coulomb"] < 0.01
+
+
+def test_positions_are_those_of_each_episode_though_time_starts_anew(tmp_path):
+    scene, _, _ = ran(tmp_path, 1, 2.0)
+    time = np.arange(0.0, 2.0, 0.01)
+    x = np.concatenate([0.1 * time, np.cos(time), -time])
+    gap = np.arange(len(x)) % 7 == 2
+    columns = {"time": np.tile(time, 3), "episode": np.repeat([0, 1, 2], len(time)),
+               "cart.rail.position": np.where(gap, np.nan, x)}  # fmt: skip
+    write_recording(tmp_path / "three.csv", columns)
+    (recording,) = read_recordings([tmp_path / "three.csv"])
+    found = positions(SceneDynamics(read_scene(scene)), recording)
+    np.testing.assert_allclose(found[:, 0], x, atol=1e-4)  # Lines over the gaps.
 
 
 def test_walls_that_nothing_touches_do_not_count(tmp_path):

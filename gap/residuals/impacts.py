@@ -166,19 +166,21 @@ def walls_of(dynamics: SceneDynamics, own: bool = False) -> ContactShapes | None
 
 
 def positions(dynamics: SceneDynamics, recording: Recording) -> np.ndarray:
-    """(n, n_q) as measured, with lines over what is missing."""
+    """(n, n_q) as measured, with lines over what is missing in an episode."""
     plant = dynamics.plant
     q = np.tile(
         plant.GetPositions(plant.CreateDefaultContext()), (len(recording.time), 1)
     )
     for joint in one_dof_joints(plant):
         name = f"{full_name(plant, joint)}.position"
-        if name in recording:
-            y = recording[name]
-            good = np.isfinite(y)
-            q[:, joint.position_start()] = np.interp(
-                recording.time, recording.time[good], y[good]
-            )
+        if name not in recording:
+            continue
+        i, there = joint.position_start(), np.isfinite(recording[name])
+        q[there, i] = recording[name][there]
+        for e in recording.episodes:  # In each, time may start anew.
+            t, y = recording.samples(name, e)
+            if len(t):
+                q[e.rows, i] = np.interp(recording.time[e.rows], t, y)
     return q
 
 
