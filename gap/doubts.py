@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from makebreak.gap.data.findings import GUESSED_GAINS, NO_COLUMN, NO_DRIVE
+from makebreak.gap.data.findings import GUESSED_GAINS, NO_COLUMN, NO_DRIVE, TOOL_WEIGHT
 from makebreak.gap.result import AGREES, GapResult
 from makebreak.gap.thresholds import UNEXPLAINED_RMS
 
@@ -20,7 +20,7 @@ def unless_doubtful(result: GapResult) -> GapResult:
         )
     undriven = [c.says for c in result.checks if c.kind == NO_DRIVE]
     if not result.effects:
-        kinds = (NO_DRIVE, NO_COLUMN)
+        kinds = (NO_DRIVE, NO_COLUMN, TOOL_WEIGHT)
         missing = " ".join(c.says for c in result.checks if c.kind in kinds)
         if result.verdict == "gap_unnamed" and missing:
             return replace(result, says=f"{result.says} {missing}")
@@ -46,7 +46,8 @@ def unless_doubtful(result: GapResult) -> GapResult:
             "or record what the motors give, for until then nothing can be named."
         )
     else:
-        return result
+        heavy = " ".join(c.says for c in result.checks if c.kind == TOOL_WEIGHT)
+        return replace(result, says=f"{result.says} {heavy}") if heavy else result
     per_channel = {
         name: {"before": each["before"], "after": each["before"]}
         for name, each in result.gap.per_channel.items()

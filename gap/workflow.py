@@ -53,6 +53,7 @@ from makebreak.gap.residuals.objects import (
 )
 from makebreak.gap.residuals.pressing import PressingProblem, presses
 from makebreak.gap.residuals.sap_lift import sap_lift
+from makebreak.gap.residuals.tool_weight import as_used, check_tool_weight
 from makebreak.gap.result import AGREES, GapMeasure, GapResult, JudgedChannel
 from makebreak.gap.search.choice import Choice, Selection
 from makebreak.gap.search.chosen_by_simulation import (
@@ -122,6 +123,7 @@ def run_gap(
     for recording in recordings:
         check_against_scene(recording, joints, bodies)
         check_drives(recording, scene)
+    recordings = as_used(recordings, dynamics)
     check_initial_names(scene, recordings)
     check_couplings(scene, dynamics.plant)
     check_meshes(dynamics.loaded, recordings)
@@ -129,6 +131,7 @@ def run_gap(
     parts = split(recordings)
     say("checking the recordings")
     checks = [*doubts, *check_recordings(parts.decided, scene_facts(dynamics.plant))]
+    checks += check_tool_weight(dynamics, parts.decided)
     is_mechanism = _is_mechanism(dynamics, recordings)
     # An impact would be smeared by means over rows.
     meets = is_mechanism and (

@@ -127,6 +127,7 @@ def read_recording(
         n_rows_in_file=n_rows,
         provenance=str(sidecar.get("provenance") or ""),
         notes=tuple(notes),
+        wrenches=sidecar.get("wrench") or {},
         quaternion_flips=flips,
         quaternion_norm_error=norm_errors,
     )

@@ -79,6 +79,20 @@ class Channel:
 
 
 @dataclass(frozen=True)
+class WrenchAsLogged:
+    """How a logged wrench differs from one on the robot, in world, without the weight
+    of what is mounted beyond the sensor.
+
+    axes: "world", or "sensor" for those of its frame. acts_on: "robot", or
+    "environment" for the opposite sign.
+    """
+
+    holds_weight: bool = False
+    axes: str = "world"
+    acts_on: str = "robot"
+
+
+@dataclass(frozen=True)
 class Episode:
     """Rows [first, last) of a recording, without a break.
 
@@ -106,7 +120,8 @@ class Recording:
     """A recording. All arrays are read-only.
 
     name: unique among the recordings read together. notes: what was done to the table
-    in reading: (kind, sentence).
+    in reading: (kind, sentence). wrenches: {`<model>.<frame>`: how its wrench was
+    logged}, where that is not as it is used (residuals/tool_weight.py).
     """
 
     name: str
@@ -120,6 +135,7 @@ class Recording:
     notes: tuple[tuple[str, str], ...] = ()
     quaternion_flips: Mapping[str, int] = field(default_factory=dict)
     quaternion_norm_error: Mapping[str, float] = field(default_factory=dict)
+    wrenches: Mapping[str, WrenchAsLogged] = field(default_factory=dict)
     raw_period_sec: float = 0.0  # Of the rows that were averaged; 0 if none were.
 
     def __contains__(self, name: str) -> bool:

@@ -8,9 +8,12 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+from makebreak.gap.data.recording import WrenchAsLogged
 from makebreak.gap.data.table import stem_of
 
-_SECTIONS = ("noise", "filters", "columns", "ignore", "join", "provenance")
+_SECTIONS = (
+    "noise", "filters", "columns", "wrench", "ignore", "join", "provenance",
+)  # fmt: skip
 
 
 def sidecar_of(path: Path) -> Path:
@@ -44,8 +47,8 @@ def read_sidecars(path: Path, given: Path | None) -> dict:
 
     Args: given: in place of the one beside the recording.
     Returns: {section: what it says}, as written but for `ignore`: (from, to, episode)
-        of spans; `join`: paths; `own`: channels that are named in the recording's own
-        sidecar.
+        of spans; `join`: paths; `wrench`: {place: WrenchAsLogged}; `own`: channels
+        that are named in the recording's own sidecar.
     Raises: ValueError that names the file and what is wrong in it.
     """
     merged: dict = {}
@@ -69,7 +72,10 @@ def read_sidecars(path: Path, given: Path | None) -> dict:
             elif key != "provenance" and value is not None:
                 if not isinstance(value, dict):
                     raise ValueError(f"{file}: {key} must be names with values")
-                value = (merged.get(key) or {}) | {str(k): v for k, v in value.items()}
+                value = {str(k): v for k, v in value.items()}
+                if key == "wrench":
+                    value = {at: _wrench(file, at, v) for at, v in value.items()}
+                value = (merged.get(key) or {}) | value
             merged[key] = value
         for key, value in (data.get("noise") or {}).items():
             number = _finite_number(f"{file}: noise of {key}", value, least=0.0)
@@ -126,6 +132,30 @@ def _spans(file: Path, said) -> list[tuple[float, float, int | None]]:
             raise ValueError(f"{file}: ignore, episode is {episode!r}")
         spans.append((first, last, episode))
     return spans
+
+
+_WRENCH = {
+    "holds_weight": (False, True),
+    "axes": ("world", "sensor"),
+    "acts_on": ("robot", "environment"),
+}
+
+
+def _wrench(file: Path, at: str, said) -> WrenchAsLogged:
+    """How a wrench was logged; what is not said is as the format has it."""
+    if not isinstance(said, dict) or set(said) - set(_WRENCH):
+        raise ValueError(
+            f"{file}: wrench of {at}: got {said!r}, expected {{holds_weight: true, "
+            "axes: sensor, acts_on: environment}, or some of these"
+        )
+    for key, value in said.items():
+        expected = _WRENCH[key]
+        if not any(type(value) is type(x) and value == x for x in expected):
+            words = " or ".join(str(x).lower() for x in expected)
+            raise ValueError(
+                f"{file}: wrench of {at}: {key} is {value!r}, expected {words}"
+            )
+    return WrenchAsLogged(**said)
 
 
 def _finite_number(what: str, value, least: float = -np.inf) -> float:

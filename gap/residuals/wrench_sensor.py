@@ -52,7 +52,7 @@ def wrench_sensors(
     sensors: list[WrenchSensor] = []
     first = 0
     for place in recordings[0].places(FORCE):
-        frame = _frame_of(plant, place)
+        frame = frame_of(plant, place)
         forces, moments = (
             tuple(f"{place}.{a}" for a in axes) for axes in (FORCE, MOMENT)
         )
@@ -67,7 +67,7 @@ def wrench_sensors(
     return sensors
 
 
-def _frame_of(plant: MultibodyPlant, place: str) -> Frame | None:
+def frame_of(plant: MultibodyPlant, place: str) -> Frame | None:
     """The frame "model.name", if the plant has it."""
     model, name = place.split(".", 1)
     if not plant.HasModelInstanceNamed(model):
