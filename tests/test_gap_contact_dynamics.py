@@ -678,6 +678,12 @@ def test_a_loud_block_is_told_though_it_is_fitted(tmp_path):
     # An equation that is louder goes first.
     louder = np.where(model.channel_of_rows() == 0, 9.0, left)
     assert model.loudest(SimpleNamespace(left=louder)) == (model.row_names()[0], 9.0)
+    # One moment in which an equation is far off makes it no louder; two do.
+    alone, twice = 0.5 * noise, 0.5 * noise
+    mine = np.flatnonzero(model.channel_of_rows() == 0)
+    alone[mine[:1]] = twice[mine[:2]] = 200.0
+    assert model.loudest(SimpleNamespace(left=alone))[1] < 2.0
+    assert model.loudest(SimpleNamespace(left=twice))[1] > 5.0
     # A row that is far off makes no stretch of time loud; one in ten off by 18 does, as
     # a patch that is crossed once.
     rows = np.flatnonzero(model.blocks() == number)

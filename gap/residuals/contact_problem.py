@@ -362,9 +362,10 @@ class ContactProblem(ContactCandidates, GapProblem):
         among the fitted ones alone."""
         found = [("", 0.0)]
         for k, name in enumerate(self.row_names()):
-            mine = fitted.left[self.channel_of_rows() == k]
+            mine = np.sort(np.abs(fitted.left[self.channel_of_rows() == k]))
             if len(mine) >= FEWEST_ROWS:
-                found.append((name, rms(mine)))
+                # What is really there is there in the next moment, too: they overlap.
+                found.append((name, rms(mine[:-1])))
         size, number = max(self._blocks_left(fitted.left))
         if size > max(each[1] for each in found):
             block = self._block == number
