@@ -256,8 +256,8 @@ def _errors(value: dict[str, float], hidden: Mapping) -> list[float]:
 
 
 def parameters_inside(found: Mapping, hidden: Mapping) -> list[bool]:
-    """For each parameter, whether the true value lies within two standard deviations;
-    False for a standard deviation that is not finite."""
+    """For each parameter that was fitted, whether the true value lies within two
+    standard deviations; False for a standard deviation that is not finite."""
     options = [hidden]
     if "phase" in hidden:  # The same force, half a turn later.
         sizes = ("fx", "fy", "fz", "amplitude")
@@ -267,7 +267,7 @@ def parameters_inside(found: Mapping, hidden: Mapping) -> list[bool]:
     for option in options:
         now = []
         for name in found:
-            if name not in option:
+            if name not in option or not found[name].get("fitted", True):
                 continue
             off = float(found[name]["value"]) - option[name]
             if name == "phase":

@@ -181,6 +181,9 @@ def test_an_interval_holds_the_truth_or_not():
         found["parameters"]["coulomb"]["std"] = std
         got = score(case, {"verdict": "gap_named", "effects": [found]})
         assert got.inside == (inside,), value
+    found["parameters"]["coulomb"]["fitted"] = False  # As modelled: no interval.
+    got = score(case, {"verdict": "gap_named", "effects": [found]})
+    assert got.inside == ()
     wave = hidden("torque_ripple", "p.j1", amplitude=1.0, phase=0.1)
     found = effect("torque_ripple", "p.j1", amplitude=-1.05, phase=0.1 + 3 * np.pi)
     got = score(log_truth([wave]), {"verdict": "gap_named", "effects": [found]})
