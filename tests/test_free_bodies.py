@@ -2,22 +2,27 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import yaml
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.gap.data.conditioning import condition
 from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.numerics.free_body import simulate_all
+from makebreak.gap.residuals import objects
 from makebreak.gap.residuals.objects import FlightProblem
 from makebreak.gap.simulation.free_bodies import FreeBodiesScene
 from makebreak.gap.simulation.free_windows import FreeBodyModel
 from makebreak.gap.simulation.scene_simulation import SceneSimulation, SimulationConfig
 from makebreak.gap.simulation.unseen_spin import rolling
+from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect
-from makebreak.models.scene import InitialSection, read_scene
+from makebreak.models.scene import InitialSection, load_scene, read_scene
 
 RED, BLUE = "red.ball", "blue.ball"
 RADII, MASSES = {"red": 0.03, "blue": 0.035}, {"red": 0.2, "blue": 0.13}
@@ -148,6 +153,63 @@ def test_two_balls_collide_as_in_drakes_continuous_plant(scene, effects):
     np.testing.assert_allclose(got[:, :, 7:10], want[:, :, 7:10], atol=0.1)
 
 
+@pytest.mark.parametrize("time_step", [0.0, 1e-3])
+def test_a_contact_point_lies_between_two_surfaces_where_drake_has_it(
+    tmp_path, time_step
+):
+    """Midway with a continuous plant; with a discrete one nearer to the harder one."""
+    scene = read_scene(write_balls(tmp_path, time_step))
+    depth, along = 1e-3, np.array([0.6, 0.0, 0.8])
+    places = {RED: np.array([0.0, 0.0, RADII["red"] - depth])}
+    places[BLUE] = places[RED] + (sum(RADII.values()) - depth) * along
+    builder = DiagramBuilder()
+    plant = load_scene(scene, builder).plant
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    own = plant.GetMyContextFromRoot(context)
+    for name, place in places.items():
+        body = plant.GetBodyByName("ball", plant.GetModelInstanceByName(name[:-5]))
+        plant.SetFreeBodyPose(own, body, RigidTransform(place))
+    contacts = plant.get_contact_results_output_port().Eval(own)
+    points = [
+        contacts.point_pair_contact_info(i).contact_point()
+        for i in range(contacts.num_point_pair_contacts())
+    ]
+    on_table, of_balls = sorted(points, key=lambda p: p[2])
+    bodies = FreeBodiesScene(scene).bodies()
+    share = bodies.each[0].pairs[0, 0, 4]
+    assert on_table[2] == pytest.approx(-share * depth, rel=1e-6)
+    out = float((of_balls - places[RED]) @ along)
+    share = bodies.mutual[0, 1, 4]
+    assert out == pytest.approx(RADII["red"] - (1.0 - share) * depth, rel=1e-6)
+
+
+def test_bodies_that_a_scene_lets_pass_through_each_other_do_not_touch(tmp_path):
+    file = write_balls(tmp_path)
+    text = yaml.safe_load(file.read_text())
+    group = {
+        "name": "balls", "members": ["red::ball", "blue::ball"],
+        "ignored_collision_filter_groups": ["balls"],
+    }  # fmt: skip
+    text["directives"].append({"add_collision_filter_group": group})
+    file.write_text(yaml.safe_dump(text))
+    numbers = FreeBodiesScene(read_scene(file))
+    assert not numbers.meet(RED, BLUE)
+    assert not numbers.bodies().mutual.any()
+    assert all(body.pairs[:, :, 0].all() for body in numbers.bodies().each)
+
+
+def test_a_warning_names_what_its_own_body_lies_on(scene, monkeypatch):
+    dynamics = SceneDynamics(scene)
+    model = SimpleNamespace(
+        with_faces=[RED], bodies=[RED, BLUE], on_side=[], dynamics=dynamics,
+        recordings=[SimpleNamespace(name="log")],
+    )  # fmt: skip
+    monkeypatch.setattr(objects, "touched", lambda model, at: np.zeros((1, 2)))
+    (finding,) = objects.point_on_face_of(model)  # type: ignore[arg-type]
+    assert f"gives {RED} on table.table a single" in finding.says
+
+
 def slide(mu: float, resistance: float, v: float, w: float, times, radius: float):
     """x, v and slip of a ball that slides, then rolls on against a resistance; closed
     form of a solid sphere: m dv/dt = -mu m g, and dw/dt = 5/2 mu g/r."""
@@ -244,6 +306,17 @@ def test_collisions_of_balls_leave_no_more_than_noise_with_the_friction_they_had
     assert sum(w.after_hits > 0 for w in model.windows) >= 5
     assert left(model) > 3.0
     assert left(model, [true]) < 1.3
+
+
+@pytest.mark.parametrize("columns", ["x y z", "x y z qw qx qy qz"])
+def test_only_where_an_orientation_is_not_measured_a_ball_is_taken_to_roll(
+    scene, tmp_path, columns
+):
+    log = write_collisions(tmp_path, scene, [], 1, columns)
+    recordings, _ = condition(read_recordings([log]), False)
+    model = FreeBodyModel(scene, recordings)
+    rolls = [each is not None for w in model.windows for each in w.rolling]
+    assert rolls == [columns == "x y z"] * (2 * len(model.windows))
 
 
 def test_bodies_with_faces_that_come_near_each_other_are_left_to_drake(tmp_path):
