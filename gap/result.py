@@ -315,7 +315,7 @@ def _effect_json(each: NamedEffect) -> dict[str, Any]:
         "parameters": {
             name: {
                 "value": _number(p.value),
-                "std": _number(p.std if p.fitted else float("nan")),
+                "std": _number(p.std) if p.fitted else None,
                 "unit": p.unit,
                 "or_more": p.or_more,
                 "fitted": p.fitted,

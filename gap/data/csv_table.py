@@ -140,6 +140,11 @@ def dialect_of(
     return Dialect(separator, comma, '"' in body, tuple(names), lists, unused, headless)
 
 
+def is_nameless(column: str) -> bool:
+    """Whether it is called so for want of a name."""
+    return column.startswith(NAMELESS) and column.removeprefix(NAMELESS).isdigit()
+
+
 def _are_values(cells: Sequence[str], separator: str) -> bool:
     """Whether a first line holds a row's numbers rather than names. Whole numbers that
     count up by one are names, as pandas writes them for want of others."""

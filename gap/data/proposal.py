@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import yaml
 
-from makebreak.gap.data.csv_table import NAMELESS
+from makebreak.gap.data.csv_table import is_nameless
 from makebreak.gap.data.table import COMMANDS, is_channel
 
 DEG = np.pi / 180.0
@@ -126,7 +126,7 @@ def propose(
         quantity = _quantity(name, [j for j in joints if _names(name, j)])
         if quantity is None:
             why = "not a quantity that gap compares"
-            if name.startswith(NAMELESS):
+            if is_nameless(name):
                 why = "the file does not name it: say here what it is"
             found[name] = Match(name, None, why=why)
         else:
@@ -407,7 +407,7 @@ def _find_time(columns: Mapping[str, np.ndarray]) -> Match | None:
             or words
             and words[0] in _TIME_UNITS
             or re.search(r"[\[(](ns|us|ms|s|sec)[\])]\s*$", name.lower())
-            or name.startswith(NAMELESS)
+            or is_nameless(name)
             and _is_even(value)
         ):
             continue

@@ -150,27 +150,28 @@ def lowest_gap(body: FreeBody, pose) -> float:
 
 def gaps(body: FreeBody, pose) -> np.ndarray:
     """(m,) least distance of a sphere to each fixed shape [m]; pose (7,)."""
-    R, p = _matrix(np.asarray(pose[:4], float)), np.asarray(pose[4:7], float)
-    centres = p + body.spheres[:, :3] @ R.T
-    each = [
-        [_gap(c[0], c[1], c[2], r, fixed)[0] for fixed in body.fixed]
-        for c, r in zip(centres, body.spheres[:, 3], strict=True)
-    ]
-    return np.array(each).min(axis=0)
+    return _gaps(body, pose)[:, :, 0].min(axis=0)
 
 
 def nearest(body: FreeBody, pose) -> tuple[float, np.ndarray, int]:
     """Least distance of a sphere to what is fixed [m], the normal there (3,), out of
     what is fixed, and which of the fixed shapes it is (-1: there is none)."""
+    found = _gaps(body, pose)
+    if not found.size:
+        return np.inf, np.array([0.0, 0.0, 1.0]), -1
+    i, k = np.unravel_index(np.argmin(found[:, :, 0]), found.shape[:2])
+    return float(found[i, k, 0]), found[i, k, 1:], int(k)
+
+
+def _gaps(body: FreeBody, pose) -> np.ndarray:
+    """(n, m, 4) distance [m] and normal of each sphere to each fixed shape."""
     R, p = _matrix(np.asarray(pose[:4], float)), np.asarray(pose[4:7], float)
-    found = (np.inf, np.array([0.0, 0.0, 1.0]), -1)
-    for sphere in body.spheres:
-        c = p + R @ sphere[:3]
-        for k, each in enumerate(body.fixed):
-            gap, *n = _gap(c[0], c[1], c[2], sphere[3], each)
-            if gap < found[0]:
-                found = (float(gap), np.array(n), k)
-    return found
+    centres = p + body.spheres[:, :3] @ R.T
+    found = [
+        [_gap(c[0], c[1], c[2], radius, fixed) for fixed in body.fixed]
+        for c, radius in zip(centres, body.spheres[:, 3], strict=True)
+    ]
+    return np.array(found).reshape(len(body.spheres), len(body.fixed), 4)
 
 
 @njit(cache=True)
@@ -245,6 +246,19 @@ def _friction(speed, slip, mu_s, mu_d):
 
 
 @njit(cache=True)
+def _normal_force(stiffness, dissipation, damper, depth, un):
+    """At a velocity un out of the depth."""
+    return stiffness * depth * (1.0 - dissipation * un) - damper * un
+
+
+@njit(cache=True)
+def _slip(u0, u1, u2, un, n0, n1, n2):
+    """A velocity less its part un along the normal, and how fast that is."""
+    u0, u1, u2 = u0 - un * n0, u1 - un * n1, u2 - un * n2
+    return u0, u1, u2, np.sqrt(u0 * u0 + u1 * u1 + u2 * u2)
+
+
+@njit(cache=True)
 def _push(F, T, b, a0, a1, a2, f0, f1, f2):
     """Adds a force at an arm from the centre of mass of body b."""
     F[b, 0] += f0
@@ -286,13 +300,10 @@ def _meet(F, T, s, c, spheres, owner, i, j, law, slip):
     u1 -= s[b, 11] + s[b, 9] * b0 - s[b, 7] * b2
     u2 -= s[b, 12] + s[b, 7] * b1 - s[b, 8] * b0
     un = u0 * n0 + u1 * n1 + u2 * n2
-    fn = law[0] * depth * (1.0 - law[1] * un) - law[5] * un
+    fn = _normal_force(law[0], law[1], law[5], depth, un)
     if fn <= 0.0:
         return
-    u0 -= un * n0
-    u1 -= un * n1
-    u2 -= un * n2
-    speed = np.sqrt(u0 * u0 + u1 * u1 + u2 * u2)
+    u0, u1, u2, speed = _slip(u0, u1, u2, un, n0, n1, n2)
     share = 0.0
     if speed > 1e-14:
         share = _friction(speed, slip, law[2], law[3]) * fn / speed
@@ -383,15 +394,11 @@ def _rate(t, s, mass, com, inertia, inverse, gravity, spheres, owner, fixed, pai
             u1 = s[b, 11] + w2 * a0 - w0 * a2
             u2 = s[b, 12] + w0 * a1 - w1 * a0
             un = u0 * n0 + u1 * n1 + u2 * n2
-            fn = pairs[j, m, 0] * depth * (1.0 - pairs[j, m, 1] * un)
-            fn -= pairs[j, m, 5] * un
-            fn *= share_of
+            law = pairs[j, m, 0], pairs[j, m, 1], pairs[j, m, 5]
+            fn = _normal_force(*law, depth, un) * share_of
             if fn <= 0.0:
                 continue
-            u0 -= un * n0
-            u1 -= un * n1
-            u2 -= un * n2
-            speed = np.sqrt(u0 * u0 + u1 * u1 + u2 * u2)
+            u0, u1, u2, speed = _slip(u0, u1, u2, un, n0, n1, n2)
             share = 0.0
             if speed > 1e-14:
                 mu_s, mu_d = pairs[j, m, 2], pairs[j, m, 3]

@@ -157,8 +157,8 @@ def _add_damper(
     return damper.GetOutputPort("generalized_force")
 
 
-# Kinds that set the normal force of a contact.
 FRICTION = "contact_friction"
+# Kinds that set the normal force of a contact.
 CONTACT_LAW = (STIFFNESS, DISSIPATION) = ("contact_stiffness", "contact_dissipation")
 DAMPER = "contact_damping"  # A linear damper instead of the dissipation.
 
