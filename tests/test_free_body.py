@@ -52,6 +52,7 @@ def scene(tmp_path_factory):
         Effect("corner_radius", ["cube.cube"], {"radius": 0.006}),
         Effect("plane_height", ["ground.ground"], {"height": 0.004}),
         Effect("plane_tilt", ["ground"], {"roll": 0.02, "pitch": -0.03}),
+        Effect("wall_position", ["ground"], {"x": 0.02, "z": -0.004}),
         Effect("body_drag", ["cube.cube"], {"linear": 0.4, "angular": 1e-4}),
         Effect("constant_force", ["cube.cube"], {"fx": 0.1, "fy": -0.2, "fz": 0.3}),
     ],

@@ -150,20 +150,20 @@ def lowest_gap(body: FreeBody, pose) -> float:
 
 def gaps(body: FreeBody, pose) -> np.ndarray:
     """(m,) least distance of a sphere to each fixed shape [m]; pose (7,)."""
-    return _gaps(body, pose)[:, :, 0].min(axis=0)
+    return gaps_and_normals(body, pose)[:, :, 0].min(axis=0)
 
 
 def nearest(body: FreeBody, pose) -> tuple[float, np.ndarray, int]:
     """Least distance of a sphere to what is fixed [m], the normal there (3,), out of
     what is fixed, and which of the fixed shapes it is (-1: there is none)."""
-    found = _gaps(body, pose)
+    found = gaps_and_normals(body, pose)
     if not found.size:
         return np.inf, np.array([0.0, 0.0, 1.0]), -1
     i, k = np.unravel_index(np.argmin(found[:, :, 0]), found.shape[:2])
     return float(found[i, k, 0]), found[i, k, 1:], int(k)
 
 
-def _gaps(body: FreeBody, pose) -> np.ndarray:
+def gaps_and_normals(body: FreeBody, pose) -> np.ndarray:
     """(n, m, 4) distance [m] and normal of each sphere to each fixed shape."""
     R, p = _matrix(np.asarray(pose[:4], float)), np.asarray(pose[4:7], float)
     centres = p + body.spheres[:, :3] @ R.T

@@ -14,6 +14,7 @@ from makebreak.gap.simulation.free_windows import FreeBodyModel, touched
 from makebreak.gap.simulation.windows import WindowModel
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.contact import CONTACT_LAW, DAMPER, STIFFNESS
+from makebreak.models.effects.ground import PLACE
 from makebreak.models.effects.kind import Effect
 
 # What a value is multiplied by, or what is added to it.
@@ -22,6 +23,11 @@ _TIMES = {
     "contact_stiffness": (0.1, 0.4, 0.9, 2.5),
     "contact_dissipation": (0.05, 0.4, 1.1, 2.5),
     "object_mass": (0.7, 0.97, 1.4),
+}
+# Values tried where the scene has none.
+_FROM_NONE = {
+    "contact_friction": (0.05, 0.2, 0.6),
+    "contact_dissipation": (0.05, 0.3, 1.5),
 }
 _PLUS: dict[str, dict[str, tuple[float, ...]]] = {
     "rolling_resistance": {"coefficient": (0.002, 0.006, 0.015)},
@@ -38,6 +44,7 @@ _POSITIVE = dict.fromkeys(
 _SIZES = (0.95, 0.99, 1.05)
 _DAMPED = (0.02, 0.06, 0.12, 0.25, 0.5)  # Of critical damping: a linear damper's.
 _INERTIAS = (0.97, 1.2)
+_PLACES = (-0.02, -0.008, -0.003, 0.003, 0.008, 0.02)  # Of a face that is met [m].
 # Cells a side of the ground that was touched, in search of a patch; their least size.
 CELLS, LEAST_CELL = 6, 0.01  # [m]
 # A side is moved by so many steps of so much of a cell, most often so many times.
@@ -105,6 +112,14 @@ def _is_alone(model: FreeBodyModel | WindowModel) -> bool:
     return isinstance(model, FreeBodyModel) and len(model.bodies) == 1
 
 
+def _met_axes(model: FreeBodyModel | WindowModel, at: str) -> dict[str, float]:
+    """{axis of the world: where a face of a body is met along it}; windows that Drake
+    simulates are too slow to ask."""
+    if not isinstance(model, FreeBodyModel):
+        return {}
+    return {axis: off for (name, axis), off in model.met.items() if name == at}
+
+
 def _trials(model, kind: str, at: str):
     """Of each candidate of a kind at a place: alternatives, each a list of (step,
     parameters), one for each unknown; the unknowns; and what stays as it is."""
@@ -140,9 +155,20 @@ def _trials(model, kind: str, at: str):
         critical = 2.0 * np.sqrt(stiffness * model.body(at).mass)
         values = [share * critical for share in _DAMPED]
         yield [[(c, {"damping": c})] for c in values], ("damping",), ()
+    elif kind == PLACE or (kind == "plane_height" and _met_axes(model, at)):
+        # Which of the two it is depends on where the face that is met looks.
+        for axis, off in _met_axes(model, at).items():
+            if (axis == "z") == (kind == PLACE):
+                continue
+            name = axis if kind == PLACE else "height"
+            values = [*_PLACES] if kind == PLACE else [*_PLUS[kind]["height"]]
+            if abs(off) > max(values):
+                values.append(off)
+            yield [[(d, {name: d})] for d in values], (name,), ()
     elif kind in _TIMES:
         ((name, value),) = now.items()
-        offered = [[((f - 1.0) * value, {name: f * value})] for f in _TIMES[kind]]
+        near = [f * value for f in _TIMES[kind]] if value else _FROM_NONE.get(kind, ())
+        offered = [[(v - value, {name: v})] for v in near]
         if kind == "contact_friction" and isinstance(model, FreeBodyModel):
             # Not what also changes others: a wall's would stand for the ground's.
             offered = [

@@ -22,6 +22,7 @@ from makebreak.gap.simulation.face_supports import (
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.contact import DAMPER
 from makebreak.models.effects.contact_surface import DEFAULT_DISSIPATION
+from makebreak.models.effects.ground import PLACE
 from makebreak.models.effects.kind import Effect, check_parameters, full_name
 from makebreak.models.effects.rolling_resistance import FADE_RATE
 from makebreak.models.scene import LoadedScene, Scene, load_scene
@@ -38,7 +39,8 @@ SURFACES = ("contact_friction", "contact_stiffness", "contact_dissipation")
 SENSORS = ("length_scale", "sensor_delay", "sensor_bias", "clock_skew")
 _PLANT = ("object_size", "corner_radius", "object_mass", "object_com", "object_inertia",
           "contact_friction", "contact_stiffness", "contact_dissipation",
-          "friction_patch", "plane_height", "plane_tilt", "gravity_tilt")  # fmt: skip
+          "friction_patch", "plane_height", "plane_tilt", PLACE,
+          "gravity_tilt")  # fmt: skip
 
 
 def load_free_bodies(scene: Scene) -> tuple[LoadedScene, list[RigidBody]]:
@@ -99,6 +101,11 @@ class FreeBodyScene:
             of = loaded, bodies[0]
         self.name = full_name(of[0].plant, of[1])
         self._read(*of)
+
+    @property
+    def grounds(self) -> list[str]:
+        """The bodies that the fixed shapes are of."""
+        return list(self._grounds)
 
     @property
     def has_faces(self) -> bool:
@@ -414,6 +421,10 @@ def _height(now: Numbers, p, on) -> None:
     now.fixed[on, 11] += p["height"]
 
 
+def _displace(now: Numbers, p, on) -> None:
+    now.fixed[on, 9:12] += [p.get(axis, 0.0) for axis in "xyz"]
+
+
 def _tilt(now: Numbers, p, on) -> None:
     R = RollPitchYaw(p["roll"], p["pitch"], 0.0).ToRotationMatrix().matrix()
     for m in np.flatnonzero(on):
@@ -449,5 +460,5 @@ CHANGES = {
     "contact_stiffness": _stiffness, "contact_dissipation": _dissipation,
     "plane_height": _height, "plane_tilt": _tilt, "rolling_resistance": _rolling,
     "constant_force": _force, "sinusoidal_force": _force, "body_drag": _drag,
-    DAMPER: _damper,
+    DAMPER: _damper, PLACE: _displace,
 }  # fmt: skip

@@ -9,6 +9,7 @@ and counts as noise.
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -28,6 +29,7 @@ from makebreak.gap.numerics.runs import runs_of
 from makebreak.gap.numerics.struck import struck_rows
 from makebreak.gap.simulation.free_bodies import FreeBodiesScene
 from makebreak.gap.simulation.free_body import FreeBodyScene
+from makebreak.gap.simulation.met_faces import met_faces
 from makebreak.gap.simulation.unseen_spin import TOUCHES, Rolling, rolling
 from makebreak.gap.simulation.windows import TURN, WindowedResidual, spin_of
 from makebreak.models.dynamics import SceneDynamics
@@ -191,6 +193,18 @@ class FreeBodyModel(WindowedResidual):
         near = [gaps(body, pose) < NEAR for pose in poses[:: len(poses) // 500 + 1]]
         share = np.mean(near, axis=0) if near else np.zeros(len(body.fixed))
         return share > MOSTLY
+
+    @cached_property
+    def met(self) -> dict[tuple[str, str], float]:
+        """met_faces() of all bodies, the nearest of each face."""
+        found: dict[tuple[str, str], float] = {}
+        grounds = self._numbers.each[0].grounds
+        for name, body in zip(self.bodies, self._bodies.each, strict=True):
+            paths = [_window_poses(self, name, w) for w in self.windows]
+            for key, off in met_faces(body, grounds, paths).items():
+                if key not in found or abs(off) < abs(found[key]):
+                    found[key] = off
+        return found
 
     def rubs_others(self, friction: Effect) -> bool:
         """Whether a friction of a pair is so high that the surfaces of both change, and
@@ -617,19 +631,24 @@ def touched(model: FreeBodyModel, at: str) -> np.ndarray:
     body, found = model.body(at), [np.zeros((0, 2))]
     name = first_of(model, at)
     for w in model.windows:
-        recording = model.recordings[w.recording]
-        pose = np.zeros((w.rows.stop - w.rows.start, 7))
-        pose[:, 0] = 1.0
-        for i, a in enumerate((*TURN, *_PLACE)):
-            if f"{name}.{a}" in recording:
-                pose[:, i] = recording[f"{name}.{a}"][w.rows]
-        pose = pose[np.isfinite(pose).all(axis=1)]
+        pose = _window_poses(model, name, w)
         for row in pose[:: max(len(pose) // 20, 1)]:
             if lowest_gap(body, row) < NEAR:
                 feet = placed(row, body.spheres[:, :3])
                 low = feet[:, 2] - body.spheres[:, 3]
                 found.append(feet[low < low.min() + NEAR, :2])
     return np.concatenate(found)
+
+
+def _window_poses(model: FreeBodyModel, name: str, w: FreeWindow) -> np.ndarray:
+    """(n, 7) as _poses, of a window; upright where no orientation is measured."""
+    recording = model.recordings[w.recording]
+    pose = np.zeros((w.rows.stop - w.rows.start, 7))
+    pose[:, 0] = 1.0
+    for i, a in enumerate((*TURN, *_PLACE)):
+        if f"{name}.{a}" in recording:
+            pose[:, i] = recording[f"{name}.{a}"][w.rows]
+    return pose[np.isfinite(pose).all(axis=1)]
 
 
 def _curvature(time: np.ndarray, left: np.ndarray) -> float:
