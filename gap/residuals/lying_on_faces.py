@@ -12,8 +12,17 @@ def lying_on_faces(contacts: PermittedContacts) -> list[LiesOn]:
     """The pairs of which Drake's point contact makes one point, though an area or a
     line touches: a box, a cylinder or a hull on something fixed. Not where it also
     hangs over an edge of that (its corners alone would not carry it there), where it
-    touches with spheres too, or where both shapes are hydroelastic."""
-    found = []
+    touches with spheres too, or where both shapes are hydroelastic. Of a robot's links
+    those that pressed_with_corners() has: wheels, feet."""
+    anchored = contacts.shapes.anchored
+    of_links = [
+        s
+        for s, on in zip(contacts.slots, contacts._masks, strict=True)
+        if on.any()
+        and anchored & set(contacts._pair_of(s))
+        and not contacts._is_of_a_free_body(contacts._pair_of(s))
+    ]
+    found = pressed_with_corners(contacts, of_links)
     points, surfaces = contacts.shapes.points, contacts.shapes.surfaces
     for pair in contacts._pairs_met:
         if not contacts._lies(pair) or not contacts._is_of_a_free_body(pair):
@@ -26,7 +35,6 @@ def lying_on_faces(contacts: PermittedContacts) -> list[LiesOn]:
         if not carrying or any(s.key[0] < 0 for s in carrying):
             continue
         of_points = [points[s.key[0]] for s in carrying]
-        anchored = contacts.shapes.anchored
         if any(p.is_sphere or p.along is not None or p.body in anchored
                for p in of_points):  # fmt: skip
             continue
@@ -47,9 +55,10 @@ def lying_on_faces(contacts: PermittedContacts) -> list[LiesOn]:
 def pressed_with_corners(
     contacts: PermittedContacts, touching: Sequence[Slot]
 ) -> list[LiesOn]:
-    """The same of a robot's tools, which touch something fixed with corners of boxes
-    alone: on an edge there are two, of which Drake's point contact makes one. Not where
-    the tool also hangs over an edge of what is fixed, or both are hydroelastic.
+    """The same of a robot's links, which touch something fixed with corners of boxes
+    alone, or with sides of cylinders: on an edge there are two points, of which Drake's
+    point contact makes one. Not where the link also hangs over an edge of what is
+    fixed, or both are hydroelastic.
 
     Args: touching: slots that touch.
     """
@@ -57,16 +66,17 @@ def pressed_with_corners(
     for pair in sorted({contacts._pair_of(s) for s in touching}):
         mine = [s for s in touching if contacts._pair_of(s) == pair]
         body, ground = sorted(pair, key=lambda k: k in shapes.anchored)
-        corners = all(
-            s.key[0] >= 0 and s.a == body and shapes.points[s.key[0]].is_corner
-            for s in mine
-        )
-        if corners and not all(
+        if any(s.key[0] < 0 or s.a != body for s in mine):
+            continue
+        of_points = [shapes.points[s.key[0]] for s in mine]
+        corners = all(p.is_corner for p in of_points)
+        on_side = all(p.rim for p in of_points)
+        if (corners or on_side) and not all(
             _meets_in_an_area(contacts, shapes.points[s.key[0]].geometry,
                               shapes.surfaces[s.key[1]].geometry)
             for s in mine
         ):  # fmt: skip
-            found.append(LiesOn(body, ground, is_tool=True))
+            found.append(LiesOn(body, ground, on_side, is_tool=corners))
     return found
 
 
