@@ -42,7 +42,13 @@ from makebreak.gap.residuals.mechanism import MechanismProblem
 from makebreak.gap.residuals.whitened_rows import WhitenedRows
 from makebreak.gap.result import GapMeasure
 from makebreak.gap.search import comparison
-from makebreak.gap.search.choice import Choice, Selection, Trial, is_significant
+from makebreak.gap.search.choice import (
+    Choice,
+    Selection,
+    Trial,
+    differs,
+    is_significant,
+)
 from makebreak.gap.search.chosen_by_simulation import kept_by_simulation
 from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.search.drop import _is_certain
@@ -57,6 +63,7 @@ from makebreak.gap.verdict import (
     why_not_confirmed,
     withdraw_if_weak,
 )
+from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 from makebreak.systems.numerics.smoother import smooth
 
@@ -305,6 +312,7 @@ def test_an_effect_that_changes_from_part_to_part_is_not_steady(recordings):
         train=lambda: np.ones(n, bool),
         parts=lambda: part if recordings > 1 else np.zeros(n, int),
         blocks=lambda: np.arange(n) // 20,
+        dynamics=SimpleNamespace(now=lambda kind, at: {"damping": 0.0}),
     )
     first, second = consistency(problem, fitted)
     assert first > 20.0
@@ -315,10 +323,14 @@ def test_an_effect_that_changes_from_part_to_part_is_not_steady(recordings):
     few = 2.776 / 1.96  # By t of five.
     assert wild == pytest.approx(few * np.std(b_of, ddof=1) / np.sqrt(parts), rel=0.1)
     # A scatter takes four parts at least.
-    problem.blocks = lambda: np.arange(n) // 334
+    problem.blocks, blocks = lambda: np.arange(n) // 334, problem.blocks
     if recordings == 1:
         assert consistency(problem, fitted) == [np.inf, np.inf]
         assert scatter(problem, fitted) == [{}, {}]
+    # A damping that the scene has already is none that was found.
+    problem.blocks = blocks
+    problem.dynamics.now = lambda kind, at: {"damping": 0.3}
+    assert consistency(problem, fitted)[0] < 3.0
 
 
 def test_a_fit_that_one_part_decides_is_as_wide_as_parts_differ():
@@ -380,6 +392,7 @@ def test_a_load_that_links_could_imitate_is_the_same_in_each_part():
     problem = SimpleNamespace(
         train=lambda: np.ones(n, bool), parts=lambda: np.arange(n) * parts // n,
         blocks=lambda: np.arange(n) // 20,
+        dynamics=SimpleNamespace(now=lambda kind, at: {"damping": 0.0}),
     )  # fmt: skip
     std = 1.0 / np.linalg.norm(J)
     assert abs(value - load) < 3.0 * std and std < 0.15
@@ -398,7 +411,7 @@ class Steps:
     """r = |x - 0.3| in steps of 0.02, and what slopes say of it: nothing."""
 
     plan = SearchPlan(jumps=True)
-    dynamics = SimpleNamespace(least=lambda kind, at: {})
+    dynamics = SimpleNamespace(least=lambda kind, at: {}, now=lambda kind, at: {})
 
     def replaced(self, effects):
         return None
@@ -674,7 +687,12 @@ class TwoChannels(GapProblem):
     second alone. Both are linear; sizes are shares of the 1.5."""
 
     plan = SearchPlan(by_channel=True, least_gain=0.1, most_effects=3)
-    dynamics = SimpleNamespace(least=lambda kind, at: {})  # type: ignore[assignment]
+    dynamics = SimpleNamespace(  # type: ignore[assignment]
+        least=lambda kind, at: {},
+        now=lambda kind, at: {
+            p.name: p.neutral for p in KINDS[kind].parameters if p.neutral is not None
+        },
+    )
 
     def __init__(self, damping: float, bias: float):
         n = 18_000
@@ -1088,6 +1106,39 @@ def test_a_patch_beside_others_is_told_by_how_far_it_may_end(
     search = SimpleNamespace(problem=problem)
     chosen = [choice, *others * [replace(choice)]]
     assert _is_certain(search, chosen, None, 0) == named
+
+
+@pytest.mark.parametrize(
+    ("friction", "far", "or_more", "named"),
+    [(0.32, 0.08, (), False), (0.32, 0.02, (), True), (0.5, 0.2, ("friction",), True)],
+)
+def test_a_friction_that_may_be_what_the_scene_has_is_not_named(
+    friction, far, or_more, named
+):
+    """Slopes give it a narrow interval, and held-out rows let it go to 0.388; but what
+    sticks may have any larger one."""
+    effect = Effect("contact_friction", ["box.box~tip.tip"], {"friction": friction})
+    choice = Choice(effect, {"friction": 0.01}, 1.7, 1.3, "", 1.0, (), (), 1)
+    dynamics = SimpleNamespace(
+        least=lambda kind, at: {}, now=lambda kind, at: {"friction": 0.388}
+    )
+    problem = SimpleNamespace(
+        widened=lambda end, k: ({"friction": far}, or_more), dynamics=dynamics
+    )
+    search = SimpleNamespace(problem=problem)
+    assert _is_certain(search, [choice], None, 0) == named
+
+
+def test_moments_of_inertia_are_named_where_one_of_them_is_not_the_scenes():
+    now = {"ixx": 7e-5, "iyy": 7e-5, "izz": 7e-5}
+    found = {"ixx": 2.5e-4, "iyy": 2.6e-4, "izz": 2.5e-4}
+    effect = Effect("object_inertia", ["ball.ball"], found)
+    for std, named in ((2e-4, False), (1e-4, True)):
+        of = dict.fromkeys(now, std)
+        choice = Choice(effect, of, 1.2, 1.0, "", 1.0, (), (), 3)
+        assert differs(choice, now) == named
+        # The scene does not say what they are.
+        assert differs(choice, {})
 
 
 @pytest.mark.parametrize(

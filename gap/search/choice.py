@@ -1,6 +1,6 @@
 """The effects that a search has chosen, and whether one of them is certain."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -165,6 +165,15 @@ def is_significant(choice: Choice, alone: bool = True) -> bool:
             with_neutral += 1
             clear += abs(value - each.neutral) > spread and not infinite
     return 2 * unknown < max(n, 1) and (clear > 0 or with_neutral == 0)
+
+
+def differs(choice: Choice, now: Mapping[str, float]) -> bool:
+    """Whether a parameter is farther than its deviation from what the scene has now, if
+    the scene says what that is."""
+    known = [n for n in choice.std if n in now and n not in choice.fixed]
+    return not known or any(
+        abs(choice.effect.parameters[n] - now[n]) > choice.std[n] for n in known
+    )
 
 
 def is_clearly_off(choice: Choice) -> bool:

@@ -10,6 +10,7 @@ from makebreak.gap.problem import Candidate, Fitted, is_sane
 from makebreak.gap.search.choice import (
     Choice,
     called,
+    differs,
     is_clearly_off,
     is_significant,
     places,
@@ -147,13 +148,20 @@ def _is_certain(
     """Whether the k-th effect is significant, and of a size that robots have: beside
     others it may have gone on, as far as gains of 0 with which nothing weighs anything.
     A kind whose parameters may end anywhere must be significant, beside others, with
-    its widened deviations too: slopes where it ended do not say how far it may go."""
+    its widened deviations too: slopes where it ended do not say how far it may go. Of
+    what every model has (a friction, moments of inertia), what the scene has must be
+    farther off than those."""
     choice, alone = chosen[k], len(chosen) == 1
-    least = search.problem.dynamics.least(choice.effect.kind, choice.effect.at)
+    kind, at = choice.effect.kind, choice.effect.at
+    least = search.problem.dynamics.least(kind, at)
     if not is_significant(choice, alone) or not is_sane(choice.effect, least):
         return False
-    endless = any(each.endless for each in KINDS[choice.effect.kind].parameters)
-    if alone or not endless:
+    endless = any(each.endless for each in KINDS[kind].parameters)
+    replaces = all(KINDS[kind].parameter(n).neutral is None for n in choice.std)
+    if (alone and endless) or not (endless or replaces):
         return True
-    std, _ = search.problem.widened(current, k)
-    return is_significant(replace(choice, std=std), alone)
+    std, or_more = search.problem.widened(current, k)
+    wide = replace(choice, std=choice.std | std)
+    if endless:
+        return is_significant(wide, alone)
+    return bool(or_more) or differs(wide, search.problem.dynamics.now(kind, at))

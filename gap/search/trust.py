@@ -101,11 +101,13 @@ def consistency(problem: GapProblem, fitted: Fitted) -> list[float]:
     """Of each effect, by how many standard deviations it is off neutral if what it is
     on parts of the data (recordings; stretches of time where there are few) differs
     from part to part by more than noise: its surest parameter's. What imitates another
-    law is one thing here and another there. Infinite where parts say nothing."""
+    law is one thing here and another there. Infinite where parts say nothing. Of what
+    every model has (a friction, a moment of inertia) neutral is what the scene has."""
     found: dict[int, float] = {}
+    neutrals = [problem.dynamics.now(e.kind, e.at) for e in fitted.effects]
     for (i, name), (x, variance) in _over_parts(problem, fitted).items():
-        neutral = KINDS[fitted.effects[i].kind].parameter(name).neutral
-        if neutral is not None:
+        neutral = neutrals[i].get(name, np.inf)
+        if np.isfinite(neutral):
             mean, std = random_effects(x, variance)
             found[i] = max(found.get(i, 0.0), abs(mean - neutral) / std)
     return [found.get(i, np.inf) for i in range(len(fitted.effects))]
