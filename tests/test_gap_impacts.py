@@ -104,6 +104,36 @@ def test_a_linear_damper_is_no_dissipation(tmp_path):
     assert fitted.b[own.index(True)] == 0.0
 
 
+def test_velocities_that_come_late_are_no_softer_wall(tmp_path):
+    """0.1 ms, a twentieth of a row, take a stiff wall's stiffness along unless the
+    velocities may be late."""
+    scene_file, file, true = ran(
+        tmp_path, 2, 5.0, stiffness=lambda k: 1.5 * k, damper=lambda _: 18.0
+    )
+    (recording,) = read_recordings([file])
+    columns = {"time": recording.time} | {c: recording[c] for c in recording.channels}
+    name = "cart.rail.velocity"
+    late = np.interp(recording.time - 1e-4, recording.time, recording[name])
+    write_recording(file, columns | {name: late})
+    scene, recordings = read_scene(scene_file), read_recordings([file])
+    problem, _ = problem_for(scene, recordings, SceneDynamics(scene))
+    assert isinstance(problem, ImpactProblem)
+    n = problem.nuisances()
+    timing = n.names.index(f"timing of {name}")
+    start = [
+        Effect("contact_stiffness", [PAIR], {"stiffness": 1.02 * true.stiffness}),
+        Effect("contact_damping", [PAIR], {"damping": 18.0}),
+    ]
+    screen = Screen(problem.base(), n.columns, n.prior, problem.train(), 1.0, n.reach)
+    fitted = fit_effects(problem, screen, start)
+    assert fitted.b[timing] == pytest.approx(1e-4, abs=2e-5)
+    # Without it the stiffness is 6 deviations off.
+    each = zip(fitted.effects, (true.stiffness, 18.0), fitted.std, strict=True)
+    for effect, value, std in each:
+        ((key, found),) = effect.parameters.items()
+        assert abs(found - value) < 2.0 * std[key]
+
+
 def test_free_motion_is_judged_between_walls_that_are_near(tmp_path):
     """From wall to wall in less time than a window of free motion is given: then it is
     as long as it can be, and tells the rail's friction as well as elsewhere."""

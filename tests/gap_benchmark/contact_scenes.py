@@ -21,11 +21,15 @@ from gap_benchmark.robots import Robot, to_mjcf, to_urdf
 
 G = 9.81  # [m/s2]
 STEP, DRAKE_STEP = 1e-4, 2.5e-4  # [s]
+# Of mechanisms alone. MuJoCo takes the velocity of half a step ago, so that a damper c
+# lacks c/2 steps of mass: 0.5 % of a rod that hits a wall, with STEP.
+FINE_STEP = 1e-5
 FELT_STEPS = 10  # Of MuJoCo's, which a force sensor takes the mean of.
 # So small that contacts are springs of known stiffness. MuJoCo divides it by
-# 1 - i + i r, where r is how much easier the point is to move than it is taken for (at
-# the tip of a rod: 8).
-IMPEDANCE = 0.001
+# 1 - i + i r, where r is how much easier the point is to move than it is taken for: at
+# the tip of a rod 8, so that a wall was 0.7 % softer than it was said to be. Where
+# nothing slides it is as small as MuJoCo takes it.
+IMPEDANCE, LEAST_IMPEDANCE = 0.001, 0.0001
 MODULUS = 2e7  # [Pa] of compliant hydroelastic shapes,
 DEPTH = 5e-4  # which press in by 0.3 to 0.6 mm [m].
 STUCK = 1e-3  # [m] over which what adheres holds on.
@@ -138,6 +142,10 @@ def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.append(w, a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:]))
 
 
+def _step(s: Setting) -> float:
+    return STEP if s.free else FINE_STEP
+
+
 def mjcf(s: Setting) -> str:
     """Every pair of shapes that may touch is one <pair>, named <body>/<number>."""
     shaped: list[tuple[str, bool, int, Shape]] = []
@@ -170,14 +178,14 @@ def mjcf(s: Setting) -> str:
                 at = np.array(t.place) + rotation(turn) @ np.array(x.place)
                 both = _product(turn, quaternion(x.turn))
                 world += geom(t.body, i, x, _text(at), f'quat="{_text(both)}"')
-    pairs = ""
+    pairs, share = "", IMPEDANCE if s.free else LEAST_IMPEDANCE
     for i, (a, moves, j, x) in enumerate(shaped):
         for b, also, k, y in shaped[i + 1 :]:
             if a != b and (moves or also):
                 mu = s.friction.get(pair(a, b), pair_friction(x, y))
                 pairs += (
                     f'<pair geom1="{a}/{j}" geom2="{b}/{k}" condim="3" '
-                    f'solimp="{IMPEDANCE} {IMPEDANCE} 1" friction="{mu} {mu} 0 0 0"/>'
+                    f'solimp="{share} {share} 1" friction="{mu} {mu} 0 0 0"/>'
                 )
     if s.robot is None:
         text = "<mujoco><option/><worldbody></worldbody></mujoco>"
@@ -192,7 +200,7 @@ def mjcf(s: Setting) -> str:
             )  # fmt: skip
     text = re.sub(
         r"<option[^>]*/>",
-        f'<option timestep="{STEP}" integrator="implicitfast" cone="elliptic" '
+        f'<option timestep="{_step(s)}" integrator="implicitfast" cone="elliptic" '
         f'impratio="1e4" iterations="50" tolerance="1e-12" gravity="0 0 {-G}"/>'
         '<size memory="10M"/>',
         text,
@@ -261,7 +269,7 @@ class MujocoWorld:
     def advance(self, effort: Callable, until: float) -> None:
         """effort (t, q, v) -> (n,) of the drives."""
         s, m, d = self.s, self.model, self.data
-        n = max(round((until - d.time) / STEP), 1)
+        n = max(round((until - d.time) / _step(s)), 1)
         m.opt.timestep = (until - d.time) / n
         hindered = s.robot is not None and (any(s.coulomb) or any(s.damping))
         self._felt = []
