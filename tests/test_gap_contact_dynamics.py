@@ -27,7 +27,7 @@ from makebreak.gap.problem import Outcome, SearchPlan, is_sane
 from makebreak.gap.residuals import touching
 from makebreak.gap.residuals.contact_candidates import _best_rectangles
 from makebreak.gap.residuals.contact_dynamics import ContactDynamics
-from makebreak.gap.residuals.contact_means import variance_of_means
+from makebreak.gap.residuals.contact_means import ContactMeans, variance_of_means
 from makebreak.gap.residuals.contact_problem import ContactProblem
 from makebreak.gap.residuals.permitted_contacts import Shift
 from makebreak.gap.residuals.wrench_sensor import felt_motion
@@ -35,6 +35,7 @@ from makebreak.gap.result import Considered, GapMeasure
 from makebreak.gap.search import chosen_by_simulation
 from makebreak.gap.search.choice import Choice, Selection
 from makebreak.gap.simulation import contact_windows
+from makebreak.gap.simulation.commands import Commands
 from makebreak.gap.simulation.contact_shapes import _Point, _Surface
 from makebreak.gap.simulation.contact_windows import PushWindows, led_as_measured
 from makebreak.gap.simulation.windows import WindowModel
@@ -729,6 +730,31 @@ def test_a_signal_that_jumps_between_samples_is_known_less_well():
     assert np.mean(np.square(off)) == pytest.approx(np.mean(said), rel=0.15)
 
 
+def test_a_rate_that_jumps_between_samples_is_known_less_well():
+    """A joint that is struck: the mean of its measured rate was 20 times the noise off
+    the rate of its position."""
+    period, noise, rng = 0.004, 3e-3, np.random.default_rng(0)
+    time, centres, half = period * np.arange(60), np.array([0.1]), np.array([0.05])
+    ratios = []
+    for at in rng.uniform(0.08, 0.12, 100):
+        rate = np.where(time < at, 1.5, -17.0) + noise * rng.normal(size=60)
+        # The smoothed rate, of which the mean over a test function is right.
+        true = -17.0 + 18.5 * np.clip((at - time) / period + 0.5, 0.0, 1.0)
+        recording = SimpleNamespace(
+            channels={"a.velocity": SimpleNamespace(noise=noise)}
+        )
+        track = SimpleNamespace(time=time, v=true[:, None])
+        weights, dd = permitted_forces.test_functions(time, centres, half)
+        phi = SimpleNamespace(
+            of=lambda name, y=rate, w=weights, d=dd: (w, d, y, np.ones(60, bool)),
+            recording=recording, track=track, centres=centres,
+        )  # fmt: skip
+        model = SimpleNamespace(extra=[("a.velocity", 0)])
+        off, var = ContactMeans._extra_means(model, phi, np.zeros((1, 1)))  # type: ignore
+        ratios.append(off[0, 0] / np.sqrt(var[0, 0]))
+    assert 0.3 < np.sqrt(np.mean(np.square(ratios))) < 1.3
+
+
 def test_a_body_at_rest_does_not_say_how_one_that_moves_is_accelerated():
     """What is expected is right on average of what moves (a regression of the truth on
     it has slope 1), and next to nothing of what rests; whatever share rests."""
@@ -752,6 +778,56 @@ def test_a_body_at_rest_does_not_say_how_one_that_moves_is_accelerated():
     off = np.mean((a - true)[moves, 3] ** 2)
     assert off == pytest.approx(covariance[moves, 3, 3].mean(), rel=0.1)
     assert np.sqrt(np.mean(a[~moves, 3] ** 2)) < 0.1 * noise
+
+
+def test_windows_expect_what_the_noise_of_measured_efforts_makes(monkeypatch):
+    """Where a foot may stick or slip no slope tells it: efforts are drawn, too, with
+    what jumps leave unknown. A leg that slid away in one draw turned at 100 rad/s."""
+    monkeypatch.setattr(contact_windows, "DRAWS", 400)
+    time, noise = 0.004 * np.arange(30), 0.03
+    y = np.where(np.arange(30) < 15, 0.0, 2.0)
+
+    class Windows(PushWindows):
+        def __init__(self):
+            act = SimpleNamespace(type="effort", joints=["a"])
+            self.scene = SimpleNamespace(actuation=act)
+            channel = SimpleNamespace(name="a.effort_measured", noise=noise)
+            episode = SimpleNamespace(first=0, rows=slice(0, 30))
+            self.recordings = [Recorded(time, {channel.name: (channel, y)}, [episode])]
+            given = Commands(time, {"a.effort_command": y})
+            self._commands = {(0.0,): [{0: given}]}
+            self._draw, self._led, self._pairs, self.windows = None, [], (), []
+            self.channels = ["a.position", "a.velocity"]
+
+        def simulate(self, effects, chosen=None, twists=None):
+            u = self.commands(effects)[0][0].columns["a.effort_command"]
+            return [np.column_stack([u, 400.0 * u])]
+
+    windows = Windows()
+    plain, (wide,) = windows._spread(())
+    np.testing.assert_array_equal(plain[0][:, 0], y)
+    np.testing.assert_array_equal(windows.simulate(())[0], plain[0])
+    quiet = np.delete(np.arange(30), [13, 14, 15, 16])
+    np.testing.assert_allclose(wide[quiet, 0], noise**2, rtol=0.3)
+    np.testing.assert_allclose(wide[quiet, 1], (400.0 * noise) ** 2, rtol=0.3)
+    assert wide[14:16, 0].min() > 0.5 * 2.0**2 / 24.0
+
+
+class Recorded:
+    """A recording of a few measured channels: {name: (channel, values)}."""
+
+    def __init__(self, time, channels, episodes):
+        self.time, self._of, self.episodes = time, channels, episodes
+        self.channels = {name: channel for name, (channel, _) in channels.items()}
+
+    def __contains__(self, name):
+        return name in self._of
+
+    def __getitem__(self, name):
+        return self._of[name][1]
+
+    def commands(self):
+        return []
 
 
 def test_what_a_planar_camera_says_of_the_height_is_not_compared(tmp_path):

@@ -28,7 +28,7 @@ from makebreak.gap.numerics.selection import (
     spread_by_blocks,
     std_of_shared_errors,
 )
-from makebreak.gap.numerics.signal_noise import noise_beside
+from makebreak.gap.numerics.signal_noise import jump_variance, noise_beside
 from makebreak.gap.numerics.weak_form import make_bumps
 from makebreak.gap.problem import (
     Candidate,
@@ -1348,6 +1348,43 @@ def test_a_jump_of_a_measured_effort_is_known_to_within_a_period(sampled):
     assert near.sum() >= 1
     np.testing.assert_allclose(std[: len(off)][near], off[near], rtol=0.3)
     assert std[bumps.centre > 0.5].max() == 0.0
+
+
+def test_a_jump_that_has_decayed_between_samples_may_have_been_anything():
+    """A drive that answers a step with all it has for a millisecond, sampled each four:
+    of samples, what a mean is off by is no more than said; of one that holds its step,
+    and of a slow answer, no more is said than the jump tells."""
+    rng, noise, period = np.random.default_rng(3), 0.01, 0.004
+    time, fine = period * np.arange(800), np.arange(0.0, 3.2, 1e-5)
+    starts = 0.1 * np.arange(1, 31) + rng.uniform(0.0, period, 30)
+
+    def answers(t, fast: float, slow: float) -> np.ndarray:
+        y = np.zeros(len(t))
+        for at in starts:
+            u = np.maximum(t - at, 0.0)
+            y += (t >= at) * (40.0 * np.exp(-u / fast) + 5.0 * np.exp(-u / slow))
+        return y
+
+    exact = answers(fine, 1e-3, 0.012)
+    y = answers(time, 1e-3, 0.012) + noise * rng.normal(size=len(time))
+    off = np.array([
+        np.trapezoid(exact[a : a + 401], dx=1e-5) - 0.5 * period * (y[k] + y[k + 1])
+        for k, a in ((k, round(time[k] / 1e-5)) for k in range(798))
+    ])  # fmt: skip
+    said = period * np.sqrt(jump_variance(y, noise))
+    hit = np.searchsorted(time, starts) - 1
+    # Of an interval both rows at its ends are less sure.
+    std = np.hypot(said[hit], said[hit + 1])
+    assert np.sqrt(np.mean((off[hit] / std) ** 2)) < 1.2
+    others = np.setdiff1d(
+        np.arange(798), np.concatenate([hit + k for k in (-1, 0, 1, 2)])
+    )
+    assert said[others].max() < 0.02 * std.min()
+    held = np.where(time % 0.1 < 0.05, 0.0, 5.0) + noise * rng.normal(size=len(time))
+    slow = answers(time, 0.1, 0.1) + noise * rng.normal(size=len(time))
+    for signal in (held, slow):
+        jumps = np.abs(np.diff(signal)).max()
+        assert np.sqrt(jump_variance(signal, noise).max()) < 1.1 * jumps / np.sqrt(24.0)
 
 
 def test_a_smooth_effort_has_no_jumps():

@@ -19,6 +19,7 @@ from makebreak.gap.numerics.permitted_forces import (
     held_means,
     test_functions,
 )
+from makebreak.gap.numerics.signal_noise import jump_variance
 from makebreak.gap.residuals.scene_motion import SmoothedEpisode
 from makebreak.gap.residuals.touching import Touching
 from makebreak.gap.simulation.windows import TURN
@@ -274,7 +275,8 @@ class ContactMeans(Touching):
             name = f"{joint}.effort_measured"
             w, _, y, _ = phi.of(name)
             noise = phi.recording.channels[name].noise
-            return w @ y, variance_of_means(w, y, noise), np.zeros(K)
+            unknown = jump_variance(y, noise)
+            return w @ y, variance_of_means(w, y, noise, unknown), np.zeros(K)
         if how == "command":
             return self._commanded_effort(joint, phi, held)
         if how == "law":
@@ -356,9 +358,11 @@ class ContactMeans(Touching):
                 other, off = effort[:, i], MODELLED * float(np.std(effort[:, i]))
             else:
                 other, off = w @ v[there, i], 0.01 * float(np.std(v[:, i])) + 1e-4
-            size = _squared(w)
+            size, noise = _squared(w), phi.recording.channels[name].noise
             columns.append(np.where(size > 0.0, w @ y - other, 0.0))
-            variances.append(size * phi.recording.channels[name].noise ** 2 + off**2)
+            # Where a joint is struck its smoothed rate changes over several samples.
+            jumps = w.multiply(w) @ jump_variance(y, noise)
+            variances.append(size * noise**2 + jumps + off**2)
         return _side_by_side(columns, phi), _side_by_side(variances, phi)
 
 
@@ -372,11 +376,15 @@ def _squared(w: csr_matrix) -> np.ndarray:
     return np.asarray(w.multiply(w).sum(axis=1)).ravel()
 
 
-def variance_of_means(w: csr_matrix, y: np.ndarray, noise: float) -> np.ndarray:
+def variance_of_means(
+    w: csr_matrix, y: np.ndarray, noise: float, unknown: np.ndarray | float = 0.0
+) -> np.ndarray:
     """(K,) of the means w @ y of samples y (n,): of their noise, and of what the signal
     does between them. Where it goes by d from one sample to the next its mean there is
     anything between the two, uniform: d^2/12. (An effort that jumps by 3 N m within a
-    tenth of a second was off by six times its noise.)"""
+    tenth of a second was off by six times its noise.) unknown: (n,) variance that the
+    signal has between its samples, if that is more."""
     steps = np.maximum(np.diff(y) ** 2 - 2.0 * noise**2, 0.0)
     between = 0.5 * (np.append(steps, 0.0) + np.append(0.0, steps)) / 12.0
+    between = np.maximum(between, unknown)
     return np.asarray(w.multiply(w) @ (noise**2 + between)).ravel()

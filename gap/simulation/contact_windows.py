@@ -17,6 +17,8 @@ import numpy as np
 from makebreak.gap.data.recording import Episode, Recording
 from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.numerics.runs import runs_of
+from makebreak.gap.numerics.signal_noise import jump_variance
+from makebreak.gap.simulation.commands import Commands
 from makebreak.gap.simulation.contact_shapes import ContactShapes, poses_of
 from makebreak.gap.simulation.face_supports import LiesOn, add_supports
 from makebreak.gap.simulation.scene_simulation import SceneSimulation
@@ -39,6 +41,7 @@ APART = 5e-3  # What is so far from all that could push it is left alone [m],
 GOES, SEEMS = 3e-3, 4.0  # It is pushed if it goes so far [m], times its noise.
 SEEN_APART, COMES_SEC = 0.02, 0.2  # asked every so often, and no longer before a push.
 DRAWS = 3  # Of uncertain starts.
+FARTHEST, FARTHEST_RATE = 1.0, 100.0  # That draws may be apart [m], [rad]; a second.
 LAW = 0.02  # How exact friction, a mass or a gain can be known by laws of contact.
 # Laws of contact are approximations: of how far an object moves, and a driven joint.
 BLUR, BLUR_DRIVEN = 0.005, 0.0005
@@ -65,6 +68,7 @@ class PushWindows(WindowModel):
     ):
         self._only, self._pairs = episodes, tuple(pairs)
         self._shapes: ContactShapes | None = None
+        self._draw: np.random.Generator | None = None  # Of efforts, while it is there.
         scene, led = led_as_measured(scene, recordings)
         self._led = led
         every = [_most_of(r, e) for r in recordings for e in r.episodes]
@@ -105,6 +109,30 @@ class PushWindows(WindowModel):
                 columns[f"{joint}.position_command"] = now
                 columns[f"{joint}.velocity_command"] = np.interp(time, rows, v)
         return time, columns
+
+    def commands(self, effects: Sequence[Effect]) -> list[dict[int, Commands]]:
+        plain = super().commands(effects)
+        if self._draw is None or self._led:
+            return plain
+        return [
+            {e.first: self._other(r, e, given[e.first], self._draw) for e in r.episodes}
+            for r, given in zip(self.recordings, plain, strict=True)
+        ]
+
+    def _other(self, recording: Recording, episode: Episode, given: Commands, rng):
+        """Other efforts that their measurements allow, where these stand in for
+        commands: where a tip may stick or slip, no slope tells what noise does."""
+        rows = recording.time[episode.rows]
+        now = np.searchsorted(rows, given.time, "right") - 1
+        columns = dict(given.columns)
+        for joint in self._by_measured(recording):
+            channel = recording.channels[f"{joint}.effort_measured"]
+            jumps = jump_variance(recording[channel.name][episode.rows], channel.noise)
+            off = np.sqrt(channel.noise**2 + jumps) * rng.normal(size=len(rows))
+            columns[f"{joint}.effort_command"] = (
+                columns[f"{joint}.effort_command"] + off[now]
+            )
+        return Commands(given.time, columns)
 
     def _cut(self, i, recording: Recording, episode: Episode, hop, block, number):
         if self._only is not None and (i, episode.number) not in self._only:
@@ -229,25 +257,32 @@ class PushWindows(WindowModel):
         return other
 
     def _spread(self, effects: Sequence[Effect]):
-        """Of each window what it does, and the variance that uncertain starts make, and
-        frictions that are off by LAW: an arm that pushes along a wall may stick or slip
-        by them, and where it does not hold itself a little becomes much."""
+        """Of each window what it does, and the variance that uncertain starts make, the
+        noise of measured efforts, and frictions that are off by LAW: an arm that pushes
+        along a wall may stick or slip by them, and where it does not hold itself a
+        little becomes much."""
         rng = np.random.default_rng(0)
         plain = self.simulate(effects)
         wide = [np.zeros_like(y) for y in plain]
+        rates = ("velocity", "vx", "vy", "vz", "wx", "wy", "wz")
+        most = np.square([
+            FARTHEST_RATE if c.rsplit(".", 1)[1] in rates else FARTHEST
+            for c in self.channels
+        ])  # fmt: skip
 
         def add(other: Sequence[np.ndarray], share: float) -> None:
             for total, y, y0 in zip(wide, other, plain, strict=True):
-                off = np.minimum((y - y0) ** 2, 1.0)
-                total += np.where(np.isfinite(off), off, 1.0) * share
+                off = np.minimum((y - y0) ** 2, most)
+                total += np.where(np.isfinite(off), off, most) * share
 
         kept = self.windows
         try:
             for _ in range(DRAWS):
                 self.windows = [_drawn(w, rng) for w in kept]
+                self._draw = rng
                 add(self.simulate(effects), 1.0 / DRAWS)
         finally:
-            self.windows = kept
+            self.windows, self._draw = kept, None
         for by in (LAW, -LAW) if self._pairs else ():
             add(self.simulate(self._with_frictions(effects, 1.0 + by)), 0.5)
         return plain, wide
