@@ -331,6 +331,11 @@ class GapProblem(ABC):
         anything changed; then residuals, columns and nuisances are others."""
         return False
 
+    def permitted(self, effects: Sequence[Effect]) -> list[Effect]:
+        """The same effects, where residuals exist for them by the weights of now: what
+        was fitted by others may be refused."""
+        return list(effects)
+
     def column(
         self, effects: Sequence[Effect], k: int, name: str, r: np.ndarray
     ) -> np.ndarray:

@@ -54,6 +54,7 @@ SMALL_SHIFT = 1e-3  # First trial of a place [m].
 # What a contact may give at least, whatever stiffness the scene has [m/N]: Drake's
 # default is a hundred times stiffer than a rubber tip.
 COMPLIANCE, SHORT_SHIFT = 5e-5, 1e-5
+INSIDE = 1.02  # Times the least stiffness: where a fit may start.
 # A touch that lasts so long is no impact [s]. Of longer recordings pieces are asked.
 LASTS_SEC, ASKED_SEC, ASKED_ROWS = 0.3, 60.0, 120_000
 
@@ -270,16 +271,34 @@ class PressingProblem(FeltPlaces):
             for e in self._softened:
                 if self._at_pair(e, pair):
                     stiffness = e.parameters["stiffness"]
-                    least = pressed[on].max() / PASSED
-                    if set(pair) & self.soft:
-                        least = min(least, mine[0].stiffness / SOFT)
-                    if not stiffness > least:
-                        # Softer, and with one parameter it would explain a wall that
-                        # stands elsewhere.
+                    if not stiffness > self._softest(pair, mine[0].stiffness, pressed):
                         raise ValueError("contact_stiffness: a tool goes in too far")
             d = self._W @ nearest + pressed / stiffness
             columns.append(np.where(on, d / shape, 0.0))
         return -np.stack(columns, axis=1) if columns else np.zeros((K, 0))
+
+    def _softest(self, pair, stiffness: float, pressed: np.ndarray) -> float:
+        """[N/m] A stiffness has to be more, or with one parameter it would explain a
+        wall that stands elsewhere. Args: stiffness: the scene's; pressed (K,) [N]."""
+        least = pressed[self._told[pair]].max() / PASSED
+        return min(least, stiffness / SOFT) if set(pair) & self.soft else least
+
+    def permitted(self, effects: Sequence[Effect]) -> list[Effect]:
+        """Forces that are weighed anew, or by fewer effects, may be larger."""
+        slots, _ = self._slots([e for e in effects if e.kind in MOVES])
+        scene = {self._pair_of(s): s.stiffness for s in reversed(slots)}
+        pressed = self._pressed_with(effects)
+        out = list(effects)
+        for k, e in enumerate(effects):
+            if e.kind != STIFFNESS:
+                continue
+            for pair in scene.keys() & pressed.keys() & self._told.keys():
+                if not self._at_pair(e, pair) or not self._told[pair].any():
+                    continue
+                least = self._softest(pair, scene[pair], pressed[pair])
+                if not out[k].parameters["stiffness"] > least:
+                    out[k] = replace(e, parameters={"stiffness": INSIDE * least})
+        return out
 
     def widened(self, end: Fitted, k: int) -> tuple[dict[str, float], tuple[str, ...]]:
         """A place is known no better than how deep the tool goes in there, where no

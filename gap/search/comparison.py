@@ -31,6 +31,7 @@ from makebreak.gap.thresholds import (
     RIVAL_P_VALUE,
     SAME_ERROR,
 )
+from makebreak.models.effects.kind import Effect
 
 
 class Comparison:
@@ -228,10 +229,16 @@ class Comparison:
 
     # ----- Fits
 
+    def without(self, effects: Sequence[Effect], *which: int) -> list[Effect]:
+        """The effects but for some, where residuals exist for them."""
+        rest = [e for k, e in enumerate(effects) if k not in which]
+        return self.problem.permitted(rest)
+
     def refit(self, chosen: Sequence[Choice], current: Fitted) -> Fitted:
         """All that is chosen, fitted again by the weights of now."""
         screen = self.screen(current.r, current.fit.train)
-        effects, fixed = [c.effect for c in chosen], fixed_parameters(chosen)
+        effects = self.problem.permitted([c.effect for c in chosen])
+        fixed = fixed_parameters(chosen)
         fitted = fit_effects(self.problem, screen, effects, fixed)
         before, after = self.error(current.score), self.error(fitted.score)
         if effects == list(current.effects) and after > (1.0 + REFIT_LOSS_MAX) * before:

@@ -45,7 +45,7 @@ def drop_needless(
         left = screen.fit_nuisances(current.r)[1]
         needless: list[tuple[float, int, Fitted]] = []
         for k in range(len(chosen)):
-            rest = [e for i, e in enumerate(current.effects) if i != k]
+            rest = search.without(current.effects, k)
             fixed = [c.fixed for i, c in enumerate(chosen) if i != k]
             try:
                 smaller = fit_effects(

@@ -67,7 +67,7 @@ def _best(
                 if list(c.at) == list(chosen[i].effect.at)
                 and c.size <= chosen[i].size + chosen[j].size
             ],
-            [e for k, e in enumerate(current.effects) if k not in (i, j)],
+            search.without(current.effects, i, j),
             current,
         )  # fmt: skip
         if candidate is None:

@@ -251,7 +251,7 @@ def with_rivals_of_pairs(
     for k, choice in enumerate(chosen):
         rivals: list[Effect] = []
         if choice.paired:
-            rest = [*current.effects[:k], *current.effects[k + 1 :]]
+            rest = search.without(current.effects, k)
             screen = search.screen(search.problem.residual(rest), current.fit.train)
             near = [
                 r.candidate for r in rank(screen, free)
@@ -276,14 +276,14 @@ def in_place_of(
 ) -> Trial | None:  # fmt: skip
     """All that is chosen, with a candidate in the place of the k-th effect; None where
     that is impossible."""
-    rest = [*current.effects[:k], *current.effects[k + 1 :]]
+    rest = search.without(current.effects, k)
     fixed = fixed_parameters(chosen)
     fixed[k] = candidate.fixed
     try:
         without = search.problem.residual(rest)
         screen: Screen = search.screen(without, current.fit.train)
         [ranked] = rank(screen, [candidate])
-        trial = [*current.effects[:k], *ranked.effects, *current.effects[k + 1 :]]
+        trial = [*rest[:k], *ranked.effects, *rest[k:]]
         fit = fit_effects(search.problem, screen, trial, fixed)
     except (ValueError, RuntimeError):
         return None
