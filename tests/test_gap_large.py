@@ -138,8 +138,8 @@ def test_edges_that_are_parallel_or_far_inside_do_not_touch():
 # ----- What carries, and what stands beside it
 
 
-def problem_of(tmp_path, kind, scene, seed, most=2, **options):
-    large_scenes.write(scene, "", seed, tmp_path, most=most, **options)
+def problem_of(tmp_path, kind, scene, seed, most=2, hide="", **options):
+    large_scenes.write(scene, hide, seed, tmp_path, most=most, **options)
     return kind(
         read_scene(tmp_path / "scene.yaml"),
         read_recordings([tmp_path / "recording.csv"]),
@@ -187,6 +187,17 @@ def test_a_hole_is_left_and_met_as_it_is_felt(tmp_path):
     # Of a knock, which is over between two samples, the force is hardly known.
     var = problem.means.wrench_var[:, :3]
     assert var.max() > 4.0 * np.median(var)
+
+
+def test_a_hole_that_stands_elsewhere_was_passed_through_the_walls_that_are_open(
+    tmp_path,
+):
+    """The peg is 5.7 mm deep in one wall, and nearer to that wall's seam with the next
+    one, through which nothing goes."""
+    problem = problem_of(tmp_path, PressingProblem, "peg", 11, most=1, hide="hole")
+    [(body, off)] = problem.off.items()
+    assert problem.shapes.names[body] == "socket.socket"
+    assert off == pytest.approx({"x": 2.59e-3, "y": -5.71e-3}, abs=1e-4)
 
 
 # ----- Meshes

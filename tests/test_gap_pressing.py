@@ -498,6 +498,23 @@ def test_no_contact_is_so_soft_that_a_tool_goes_in_by_centimetres(displaced):
         displaced.left([Effect("contact_stiffness", [at], {"stiffness": 0.01 * now})])
 
 
+def test_a_stiffness_with_which_a_tool_went_in_too_far_is_moved_to_the_least(displaced):
+    """Forces that are weighed anew, or by fewer effects, forbid what was fitted."""
+    at = f"{TABLE}~gantry.tool"
+    now = displaced.dynamics.now("contact_stiffness", [at])["stiffness"]
+    soft = Effect("contact_stiffness", [at], {"stiffness": 0.01 * now})
+    firm = Effect("contact_stiffness", [at], {"stiffness": 0.5 * now})
+    place = Effect("plane_height", [TABLE], {"height": 1e-3})
+    kept, moved = displaced.permitted([place, soft])
+    assert kept == place and moved.at == soft.at
+    displaced.left([place, moved])
+    # No farther than it has to be.
+    value = moved.parameters["stiffness"]
+    with pytest.raises(ValueError, match="goes in too far"):
+        displaced.left([place, replace(moved, parameters={"stiffness": 0.9 * value})])
+    assert displaced.permitted([firm, place]) == [firm, place]
+
+
 def test_a_softer_contact_is_looked_for_only_where_no_place_explains_more(
     right, displaced
 ):

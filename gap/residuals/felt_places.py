@@ -266,14 +266,14 @@ class FeltPlaces(FixedFaces):
         self, left: Sequence[Face], off: dict[int, dict[str, float]]
     ) -> tuple[int, list[list[Face]], list[Face]]:
         """The first body that the tool is deep in; the faces of it that may have been
-        passed: all that are nearest to the tool's points, or one alone; and the faces
-        left beside those. No way where it is in no body."""
+        passed: all that are nearest to the tool's points, one of these, or one alone;
+        and the faces left beside those. No way where it is in no body."""
         passed = [f for f in left if f.off < -PASSED and self._is_of(f, off)]
         deep = self._deep_nodes(off) if passed else {}
         body = next((f.body for f in passed if f.body in deep), -1)
         mine = [f for f in passed if f.body == body]
         near = [f for f in mine if not f.is_alone]
-        ways = [near] * bool(near) + [[f] for f in mine if f.is_alone]
+        ways = [near] * (len(near) > 1) + [[f] for f in mine]
         return body, ways, [f for f in left if f not in mine]
 
     def _may_be_lifted(

@@ -22,6 +22,7 @@ KNOCKED = 8e-3  # A knock goes no deeper than this [m].
 FEWEST_ROWS = 5  # In which a face is pressed on.
 SAME = 5e-4  # A face that is off by less is where the scene has it [m].
 PASSED = 4e-3  # No contact lets a tool so far in [m].
+SEAM = 1e-5  # So far out of a face another shape covers it [m].
 CLEAR, LEAST_FORCE = 6.0, 0.5  # Times noise, [N]: a force that is felt.
 UP = np.array([0.0, 0.0, 1.0])
 STANDS, LEVEL = 1e-3, 0.9  # It stands on what is so near below it [m]; cosine.
@@ -224,17 +225,20 @@ class FixedFaces(ContactProblem):
                     continue
                 R_a, p_a = poses[point.body]
                 local = (p_a + R_a @ point.p_B - centre) @ R
-                out = np.abs(local) - half
-                deepest = np.minimum(deepest, out.max(axis=1) - point.radius)
+                d = np.stack([-local, local], axis=2) - half[:, None]
+                covered = self._covered(s, local)
+                # A point goes out through the nearest face that nothing covers.
+                out = np.where(covered & (d < 0.0), -np.inf, d)
+                least = out.max(axis=(1, 2))
+                deepest = np.minimum(deepest, least - point.radius)
                 for axis in range(3):
-                    others = np.delete(out, axis, axis=1).max(axis=1)
-                    for k, sign in ((2 * axis, -1.0), (2 * axis + 1, 1.0)):
-                        x = sign * local[:, axis]
-                        d = x - half[axis] - point.radius
-                        over = others < 0.0
-                        alone[k] = np.minimum(alone[k], np.where(over, d, np.inf))
-                        over &= (x >= 0.0) & (out[:, axis] > others)
-                        nearest[k] = np.minimum(nearest[k], np.where(over, d, np.inf))
+                    over = np.delete(d, axis, axis=1).max(axis=(1, 2)) < 0.0
+                    for side in range(2):
+                        k, x = 2 * axis + side, d[:, axis, side] - point.radius
+                        on = over & ~covered[:, axis, side]
+                        alone[k] = np.minimum(alone[k], np.where(on, x, np.inf))
+                        on &= d[:, axis, side] == least
+                        nearest[k] = np.minimum(nearest[k], np.where(on, x, np.inf))
             is_deep = np.sum(deepest < -PASSED) >= FEWEST_ROWS
             for k in range(6):
                 normal = (-1.0, 1.0)[k % 2] * R[:, k // 2]
@@ -247,6 +251,23 @@ class FixedFaces(ContactProblem):
                 if -REACH < more < min(-PASSED, off - SAME):
                     found.append(Face(s.body, normal, more, is_alone=True))
         return found
+
+    def _covered(self, s, local: np.ndarray) -> np.ndarray:
+        """(n, 3, 2) whether another shape of the body covers a box's face on either
+        side of each axis, where a point (n, 3) in the box's own frame is nearest to
+        it."""
+        covered = np.zeros((*local.shape, 2), bool)
+        (half,) = s.size
+        for other in self.shapes.surfaces:
+            if other.body != s.body or other is s:
+                continue
+            for axis in range(3):
+                for side, sign in enumerate((-1.0, 1.0)):
+                    there = np.array(local)
+                    there[:, axis] = sign * (half[axis] + SEAM)
+                    d, _ = other.distance(s.p_BG + there @ s.R_BG.T)
+                    covered[:, axis, side] |= d < 0.0
+        return covered
 
     def _kept_distance(self, d: np.ndarray, normal: np.ndarray) -> float:
         """Of distances (n_rows,) from a face the one that was kept longest where the
