@@ -8,15 +8,20 @@ import numpy as np
 import pytest
 from gap_benchmark.cases import cases, make, write
 from pydrake.common.eigen_geometry import Quaternion
-from pydrake.geometry import Box, Cylinder
+from pydrake.geometry import Box, Convex, Cylinder
 from pydrake.math import RotationMatrix
 
 from makebreak.gap.data.conditioning import condition
 from makebreak.gap.data.reading import read_recordings
-from makebreak.gap.numerics.free_body import lowest_gap, simulate
+from makebreak.gap.numerics.free_body import (
+    FreeBody,
+    lowest_gap,
+    nearest,
+    simulate,
+)
 from makebreak.gap.residuals.contact import _trials
 from makebreak.gap.simulation.face_supports import centres_of, within_faces
-from makebreak.gap.simulation.free_body import REST_DEPTH, FreeBodyScene
+from makebreak.gap.simulation.free_body import REST_DEPTH, FreeBodyScene, gone_on
 from makebreak.gap.simulation.free_windows import FreeBodyModel
 from makebreak.gap.simulation.scene_simulation import SceneSimulation, SimulationConfig
 from makebreak.models.effects.kind import Effect
@@ -161,6 +166,48 @@ def test_corners_and_inner_points_turn_as_a_face_that_presses_evenly():
             got += (1.0 - share) * np.mean(ways[1] ** power)
             want = np.mean(np.hypot(*even.T) ** power)
             np.testing.assert_allclose(got, want, rtol=tol)
+
+
+def test_a_wall_that_stands_on_a_table_goes_on_into_it():
+    """At its foot, where a corner that is a little deep is nearer to the wall's lower
+    face than to the one that it ran against."""
+    box = np.concatenate([np.eye(3).ravel(), [0.0, 0.0, -0.1], [2.0, 2.0, 0.1]])
+    half_space = np.concatenate([np.eye(3).ravel(), np.zeros(3), [-1.0, 0.0, 0.0]])
+    wall = np.concatenate([np.eye(3).ravel(), [0.5, 0.0, 0.2], [0.05, 1.0, 0.2]])
+    corner = [0.0, 0.0, 0.0, 1e-5]
+    for below, deep in ((box, 0.2), (half_space, 1.0)):
+        fixed = gone_on(np.stack([below, wall]))
+        np.testing.assert_allclose(fixed[0], below)
+        np.testing.assert_allclose(fixed[1, 12:], [0.05, 1.0, 0.2 + 0.5 * deep])
+        np.testing.assert_allclose(fixed[1, 9:12], [0.5, 0.0, 0.2 - 0.5 * deep])
+        body = FreeBody(
+            1.0, np.zeros(3), np.eye(3), np.zeros(3), np.array([corner]),
+            fixed[1:], np.zeros((1, 1, 6)), np.zeros((1, 1)), np.zeros((0, 6)),
+            np.zeros(2),
+        )  # fmt: skip
+        _, normal, _ = nearest(body, np.array([1, 0, 0, 0, 0.451, 0, 2e-4]))
+        np.testing.assert_allclose(normal, [-1.0, 0.0, 0.0])
+    # One that hangs 2 mm above it, or reaches beyond its edge, has a lower face.
+    for off in ([0.0, 0.0, 2e-3], [0.0, 1.5, 0.0]):
+        moved = np.array(wall)
+        moved[9:12] += off
+        np.testing.assert_allclose(gone_on(np.stack([box, moved]))[1], moved)
+
+
+def test_a_hull_has_spheres_within_its_largest_faces(tmp_path):
+    """A prism of six sides: within each of its ends, and of its sides."""
+    angle = np.arange(6) * np.pi / 3.0
+    ring = np.column_stack([0.05 * np.cos(angle), 0.05 * np.sin(angle)])
+    points = [[*p, z] for z in (-0.015, 0.015) for p in ring]
+    lines = [f"v {x} {y} {z}" for x, y, z in points]
+    lines += [f"f {i + 1} {(i + 1) % 6 + 1} {i + 7}" for i in range(6)]
+    lines += [f"f {(i + 1) % 6 + 1} {(i + 1) % 6 + 7} {i + 7}" for i in range(6)]
+    (tmp_path / "prism.obj").write_text("\n".join(lines) + "\n")
+    inner = within_faces(Convex(str(tmp_path / "prism.obj"), 1.0), 1e-5)
+    low = inner[inner[:, 2] < -0.0149]
+    np.testing.assert_allclose(low[:, 2], -0.015 + 1e-5)
+    np.testing.assert_allclose(np.hypot(*low[:, :2].T), 0.47 * 0.05, rtol=1e-3)
+    assert len(inner) == 12 + 6 * 4
 
 
 def with_brick(scene, folder, effects=()):

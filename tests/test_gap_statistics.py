@@ -41,12 +41,12 @@ from makebreak.gap.residuals.late_poses import wanted
 from makebreak.gap.residuals.mechanism import MechanismProblem
 from makebreak.gap.residuals.whitened_rows import WhitenedRows
 from makebreak.gap.result import GapMeasure
-from makebreak.gap.search import comparison
+from makebreak.gap.search import comparison, drop
 from makebreak.gap.search.choice import (
     Choice,
     Selection,
     Trial,
-    differs,
+    deviations_off,
     is_significant,
 )
 from makebreak.gap.search.chosen_by_simulation import kept_by_simulation
@@ -1045,6 +1045,15 @@ def test_an_effect_that_recordings_contradict_is_not_named():
     assert select(Wavering([9.0, -1.5, 7.0, -2.0, 5.5])).choices == ()
 
 
+@pytest.mark.parametrize(("spread", "named"), [(0.5, 1), (50.0, 0)])
+def test_an_effect_whose_reported_interval_holds_the_scenes_value_is_not_named(
+    monkeypatch, spread, named
+):
+    """(A force of 0.05 +- 0.3 N, of which slopes say 0.01 N.)"""
+    monkeypatch.setattr(drop, "scatter", lambda problem, fitted: [{"bias": spread}])
+    assert len(select(Wavering([1.0, 1.3, 0.8, 1.1, 0.7])).choices) == named
+
+
 @pytest.mark.parametrize(
     "damping, std, named",
     [(0.0, np.inf, True), (2.0, 0.5, True), (2.0, np.inf, False)],
@@ -1136,9 +1145,9 @@ def test_moments_of_inertia_are_named_where_one_of_them_is_not_the_scenes():
     for std, named in ((2e-4, False), (1e-4, True)):
         of = dict.fromkeys(now, std)
         choice = Choice(effect, of, 1.2, 1.0, "", 1.0, (), (), 3)
-        assert differs(choice, now) == named
+        assert (deviations_off(choice, now) > 1.0) == named
         # The scene does not say what they are.
-        assert differs(choice, {})
+        assert deviations_off(choice, {}) == np.inf
 
 
 @pytest.mark.parametrize(

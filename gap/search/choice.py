@@ -167,13 +167,15 @@ def is_significant(choice: Choice, alone: bool = True) -> bool:
     return 2 * unknown < max(n, 1) and (clear > 0 or with_neutral == 0)
 
 
-def differs(choice: Choice, now: Mapping[str, float]) -> bool:
-    """Whether a parameter is farther than its deviation from what the scene has now, if
-    the scene says what that is."""
+def deviations_off(choice: Choice, now: Mapping[str, float]) -> float:
+    """By how many of its deviations the surest parameter is off what the scene has now;
+    infinite if the scene does not say what that is."""
     known = [n for n in choice.std if n in now and n not in choice.fixed]
-    return not known or any(
-        abs(choice.effect.parameters[n] - now[n]) > choice.std[n] for n in known
-    )
+    off = [
+        abs(choice.effect.parameters[n] - now[n]) / max(choice.std[n], 1e-300)
+        for n in known
+    ]
+    return max(off, default=np.inf)
 
 
 def is_clearly_off(choice: Choice) -> bool:

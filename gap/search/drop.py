@@ -10,7 +10,7 @@ from makebreak.gap.problem import Candidate, Fitted, is_sane
 from makebreak.gap.search.choice import (
     Choice,
     called,
-    differs,
+    deviations_off,
     is_clearly_off,
     is_significant,
     places,
@@ -18,7 +18,7 @@ from makebreak.gap.search.choice import (
 )
 from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.search.rivals import in_place_of
-from makebreak.gap.search.trust import consistency
+from makebreak.gap.search.trust import consistency, scatter
 from makebreak.gap.thresholds import (
     CONSISTENT_Z,
     CONSISTENT_Z_BESIDE,
@@ -136,10 +136,28 @@ def keep_certain(
             k = int(np.argmin(off))
             alone = len(chosen) == 1
             if not off[k] < (CONSISTENT_Z if alone else CONSISTENT_Z_BESIDE):
-                return chosen, current
+                told = [
+                    _as_reported(search, c, of)
+                    for c, of in zip(
+                        chosen, scatter(search.problem, current), strict=True
+                    )
+                ]
+                k = int(np.argmin(told))
+                if not told[k] <= 1.0:
+                    return chosen, current
             sure = [*chosen[:k], *chosen[k + 1 :]]
         chosen = sure
     return [], search.start
+
+
+def _as_reported(
+    search: Comparison, choice: Choice, scattered: dict[str, float]
+) -> float:
+    """Deviations by which an effect is off what the scene has, as they are reported:
+    by how parts of the data differ, where that is more."""
+    std = choice.std | {n: max(s, choice.std.get(n, 0.0)) for n, s in scattered.items()}
+    now = search.problem.dynamics.now(choice.effect.kind, choice.effect.at)
+    return deviations_off(replace(choice, std=std), now)
 
 
 def _is_certain(
@@ -164,4 +182,5 @@ def _is_certain(
     wide = replace(choice, std=choice.std | std)
     if endless:
         return is_significant(wide, alone)
-    return bool(or_more) or differs(wide, search.problem.dynamics.now(kind, at))
+    now = search.problem.dynamics.now(kind, at)
+    return bool(or_more) or deviations_off(wide, now) > 1.0

@@ -34,7 +34,7 @@ MOST = 48  # Spheres of a hull; of more corners, every n-th has one.
 # Points within a face, beside those at its corners: at this share of the corners'
 # distance from the middle. With a share of the load of 0.84 (0.67 of a disc) on them
 # the face turns as one that presses evenly (mean distance and mean square; a square's).
-WITHIN_BOX, WITHIN_RIM, INNER = 0.45, 0.5, 6
+WITHIN_BOX, WITHIN_RIM, WITHIN_HULL, INNER = 0.45, 0.5, 0.47, 6
 ALIKE = 1e-6  # Normals of one face differ by no more than this.
 
 
@@ -140,8 +140,8 @@ def centres_of(
 
 def within_faces(shape, largest: float = RADIUS) -> np.ndarray:
     """(n, 4) spheres within the faces of a box or of a cylinder's ends: centre in the
-    shape's frame and radius [m], as centres_of() has them at the corners; none for
-    others."""
+    shape's frame and radius [m], as centres_of() has them at the corners; of a hull,
+    within its largest faces, as many as MOST at all; none for others."""
     found = centres_of(shape, largest=largest)
     if found is None:
         return np.zeros((0, 4))
@@ -156,10 +156,35 @@ def within_faces(shape, largest: float = RADIUS) -> np.ndarray:
         inner = np.array(corners[:: RIM // INNER])
         inner[:, :2] *= WITHIN_RIM
         places.append(inner)
-    else:
+    elif isinstance(shape, (Convex, Mesh)):
+        places = _within_hull(shape.GetConvexHull(), radius)
+    if not places:
         return np.zeros((0, 4))
     inner = np.concatenate(places)
     return np.column_stack([inner, np.full(len(inner), radius)])
+
+
+def _within_hull(hull, radius: float) -> list[np.ndarray]:
+    """Points within the largest faces, one for each corner of them."""
+    found = []
+    for i in range(hull.num_faces()):
+        face = hull.element(i)
+        corners = np.array([
+            hull.vertex(face.vertex(k)) for k in range(face.num_vertices())
+        ])  # fmt: skip
+        normal = np.array(hull.face_normal(i))
+        following = np.roll(corners, -1, axis=0)
+        area = 0.5 * float(normal @ np.cross(corners, following).sum(axis=0))
+        middle = corners.mean(axis=0)
+        inner = middle + WITHIN_HULL * (corners - middle) - radius * normal
+        found.append((area, inner))
+    found.sort(key=lambda each: -each[0])
+    places: list[np.ndarray] = []
+    for _, inner in found:
+        if sum(len(each) for each in places) + len(inner) > MOST:
+            break
+        places.append(inner)
+    return places
 
 
 def _within(corner, normals, offsets, radius: float) -> np.ndarray:

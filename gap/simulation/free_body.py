@@ -1,5 +1,6 @@
 """What a scene's one free body feels, as numbers for the fast stepping of it."""
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -29,6 +30,8 @@ from makebreak.models.scene import LoadedScene, Scene, load_scene
 
 # What a sphere is: the body's own, or stands in for a corner, a face or a round edge.
 SPHERE, CORNER, WITHIN, ROUND = range(4)
+# [m] As far a box may be above what it stands on; it goes on below a half-space.
+STANDS, BELOW = 1e-3, 1.0
 REST_DEPTH = 2e-5  # [m] Of a body on a face that is not stiffer than it need be.
 AT_CORNERS = 0.4  # Of a face's load; it is 0.16 (a disc's rim: 0.33) if pressed evenly.
 # Forces that have their own numbers here; what changes shapes, inertias and surfaces is
@@ -191,7 +194,7 @@ class FreeBodyScene:
                 each = [(CORNER, [*p, corners[1]]) for p in corners[0]]
                 if not (self._on_side and isinstance(shape, Cylinder)):
                     each += [(WITHIN, list(s)) for s in within_faces(shape, POINT)]
-                    inner = 1.0 if isinstance(shape, Box) else RIM / INNER
+                    inner = RIM / INNER if isinstance(shape, Cylinder) else 1.0
             axis, rim, stands = X.rotation().col(2), 0.0, False
             if isinstance(shape, Cylinder):
                 self.axes.append(axis)
@@ -243,7 +246,8 @@ class FreeBodyScene:
         ).reshape(len(mine), len(others))[of]
         self._numbers = Numbers(
             np.array(mass), com, central, np.array(spheres),
-            np.array(fixed).reshape(-1, 15), np.array(origins).reshape(-1, 3),
+            gone_on(np.array(fixed).reshape(-1, 15)),
+            np.array(origins).reshape(-1, 3),
             np.array([_surface(inspector, g) for g in mine])[of],
             np.array([_surface(inspector, g) for g in others]).reshape(-1, 4),
             np.zeros(len(others)), np.zeros((0, 6)), np.zeros(2), np.zeros((0, 6)),
@@ -282,6 +286,49 @@ class Numbers:
     role: np.ndarray
     inner: np.ndarray
     rims: np.ndarray
+
+
+def gone_on(fixed: np.ndarray) -> np.ndarray:
+    """Fixed shapes (m, 15) as of FreeBody, in which a box that stands on another shape
+    with a whole face goes on into it, to its far end.
+
+    What runs against such a box meets its foot, where the face that it stands on would
+    be the nearest to a corner that is a little deep, and would push it down.
+    """
+    out = np.array(fixed)
+    signs = np.array(list(itertools.product((-1.0, 1.0), repeat=2)))
+    for i, box in enumerate(fixed):
+        R, half = box[:9].reshape(3, 3), box[12:]
+        if half[0] < 0.0:  # A half-space.
+            continue
+        for axis, side in itertools.product(range(3), (-1.0, 1.0)):
+            corners = np.empty((4, 3))
+            corners[:, axis] = side * half[axis]
+            across = [k for k in range(3) if k != axis]
+            corners[:, across] = signs * half[across]
+            out_of = side * R[:, axis]
+            foot = box[9:12] + corners @ R.T
+            deep = max(
+                _on_the_way_out(other, foot, out_of)
+                for k, other in enumerate(fixed) if k != i
+            ) if len(fixed) > 1 else 0.0  # fmt: skip
+            out[i, 9:12] += 0.5 * deep * out_of
+            out[i, 12 + axis] += 0.5 * deep
+    return out
+
+
+def _on_the_way_out(shape, points, way) -> float:
+    """How far all points (n, 3) can go along a way (3,) within a fixed shape; 0 if one
+    of them is more than STANDS above it."""
+    R = shape[:9].reshape(3, 3)
+    a, d = (points + STANDS * way - shape[9:12]) @ R, way @ R
+    if shape[12] < 0.0:
+        return BELOW if (a[:, 2] <= 0.0).all() and d[2] < -1e-9 else 0.0
+    if (np.abs(a) > shape[12:] + 1e-9).any():
+        return 0.0
+    steep = np.abs(d) > 1e-9
+    left = (shape[12:] - np.sign(d) * a)[:, steep] / np.abs(d[steep])
+    return STANDS + float(left.min())
 
 
 def _surface(inspector, geometry) -> list[float]:
