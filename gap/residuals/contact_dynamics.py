@@ -14,6 +14,7 @@ and encoders, so that its ripple between rows does not matter.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -27,6 +28,7 @@ from makebreak.gap.residuals.permitted_contacts import (
     Shift,
 )
 from makebreak.gap.residuals.touching import LEAST_FELT
+from makebreak.gap.residuals.whitened_rows import REST_SPEED
 from makebreak.gap.simulation.windows import TURN
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.contact import CONTACT_LAW
@@ -67,6 +69,9 @@ class ContactDynamics(PermittedContacts):
         self._condition()
         q, v = self._q[m.centre], self._W @ self._node_v
         self.motion = Motion(m.time, q, v, m.acceleration, m.effort)
+        still = np.zeros_like(self._node_v)  # Laws of joints are of q and v alone.
+        order, q = np.arange(float(len(still))), self._q[self._rows]
+        self._node_motion = Motion(order, q, self._node_v, still, still)
         more = m.acceleration - self._mean_vd
         needs = self._needed_smoothed + np.einsum("kij,kj->ki", self._M, more)
         self._needs = needs - m.effort
@@ -248,14 +253,17 @@ class ContactDynamics(PermittedContacts):
             inertia[i_v + 3 : i_v + 6] = 1.0 + more[0] / before[0]
             trace = slice(4, 7)  # Of the inertia: it has no axes.
             inertia[i_v : i_v + 3] = 1.0 + more[trace].sum() / before[trace].sum()
-        key = (*inertia, *gain)
+        held = self._held(effects)
+        key = (*inertia, *gain, held.tobytes() if held.any() else None)
         if key not in self._root_of:
             C = self._sensor_covariance(inertia, gain)
             scale = np.append(inertia * np.abs(gain), np.ones(C.shape[1] - n_v))
             k = np.arange(C.shape[1])
             off = self.allowance + 1e-9 + 1e-6 * self.acting
             C[:, k, k] += (scale * off) ** 2
-            kept = [(1.0,) * (2 * n_v)]  # That of the scene as it came, and the last.
+            i = np.arange(n_v)
+            C[:, i, i] += held**2 / 3.0  # Evenly in between.
+            kept = [(*(1.0,) * (2 * n_v), None)]  # The scene's own, and the last.
             self._root_of = {k: r for k, r in self._root_of.items() if k in kept}
             self._root_of[key] = roots_of(C)
         return self._root_of[key]
@@ -291,13 +299,33 @@ class ContactDynamics(PermittedContacts):
                 raise ValueError(
                     f"effect {e.kind} is not one of equations with contact"
                 )
-            more = added_effort(e, kind, self.dynamics, self.motion)
-            if more is None:
-                raise ValueError(f"effect {e.kind}: its equations are not known")
-            P += more
+            # Friction turns, and ends, within a test function: the mean of its force is
+            # not its force at the mean velocity.
+            law = kind.joint_law is not None
+            motion = self._node_motion if law else self.motion
+            more = self._added(e, motion)
+            P += self._W @ more if law else more
         for body, own in inertial.items():
             P += self._inertial(body) @ self._more_inertia(body, own)
         return np.hstack([P, self._unbiased(m.wrench, effects)])
+
+    def _added(self, effect: Effect, motion: Motion) -> np.ndarray:
+        """(n, n_v) what the motion needs more with an effect."""
+        more = added_effort(effect, KINDS[effect.kind], self.dynamics, motion)
+        if more is None:
+            raise ValueError(f"effect {effect.kind}: its equations are not known")
+        return more
+
+    def _held(self, effects: Sequence[Effect]) -> np.ndarray:
+        """(K, n_v) by how much friction of the joints may be off its law: at rest it is
+        anything between what it is while they move one way and the other."""
+        motion, found = self._node_motion, np.zeros_like(self._node_v)
+        slow = np.full_like(motion.v, REST_SPEED)
+        for e in effects:
+            if KINDS[e.kind].joint_law is not None:
+                ways = (self._added(e, replace(motion, v=v)) for v in (slow, -slow))
+                found += 0.5 * np.abs(np.subtract(*ways))
+        return self._W @ (found * (np.abs(motion.v) < REST_SPEED))
 
     def _unbiased(self, wrench: np.ndarray, effects: Sequence[Effect]) -> np.ndarray:
         """(K, n_wrench) wrenches without the biases that effects give their sensors."""
