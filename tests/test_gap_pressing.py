@@ -817,3 +817,25 @@ def test_the_inertia_that_a_sensor_feels_is_a_slope_however_large_rows_are(tmp_p
     assert np.abs(problem.base()[on]).max() == 200.0
     after = problem.nuisances().columns[:, which]
     np.testing.assert_allclose(after[on], before[on], atol=1e-6 * np.abs(before).max())
+
+
+def test_what_a_sensor_in_the_mount_feels_of_its_tool_is_taken_off(right):
+    """As a nuisance it was a slope, along which a force that slides turned out of its
+    cone: a right model left 16 times the noise where a peg came to rest."""
+    scene, recordings, tip = right
+    names = [f"gantry.tip.f{a}" for a in "xyz"]
+    felt = []
+    for number, recording in enumerate(recordings):
+        (track,) = [t for t in tip.tracks if t.recording == number]
+        vd = tip._vd[tip._offset[tip.tracks.index(track)] :][: len(track.time)]
+        channels = dict(recording.channels)
+        for name, a in zip(names, vd.T, strict=True):
+            values = channels[name].values - MASS * a
+            channels[name] = replace(channels[name], values=values)
+        felt.append(replace(recording, channels=channels))
+    mount = PressingProblem(scene, felt)
+    assert len(mount.means.time) == len(tip.means.time)
+    motion = tip._motion_felt_by(tip.sensors[0])
+    apart = mount.means.wrench - tip.means.wrench
+    assert np.sqrt(np.mean(motion**2)) > 5.0 * np.sqrt(np.mean(apart**2))
+    assert max(mount._blocks_left(mount._without_nuisances()))[0] < 1.5

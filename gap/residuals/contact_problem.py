@@ -36,7 +36,7 @@ from makebreak.gap.residuals.widened_contacts import (
     sentence,
     widened_contacts,
 )
-from makebreak.gap.residuals.wrench_sensor import felt_motion
+from makebreak.gap.residuals.wrench_sensor import WrenchSensor, felt_motion
 from makebreak.gap.result import Where
 from makebreak.gap.simulation.contact_windows import (
     LAW,
@@ -99,6 +99,7 @@ class ContactProblem(ContactCandidates, GapProblem):
         # The model whose noise weighs all others'; None: each is weighed by its own.
         self._weights: Sequence[Effect] | None = None
         self._share_out(self.left())
+        self._take_off_motion()
         self._learn_misfit()
         # What is seen in few blocks may be loud only by the weights that were learned:
         # then these are shared out by them.
@@ -121,6 +122,30 @@ class ContactProblem(ContactCandidates, GapProblem):
         """(m,) what the scene as it came leaves, its nuisances fitted to all rows."""
         n, r = self.nuisances(), self.base()
         return Screen(r, n.columns, n.prior, np.ones(len(r), bool)).fit_nuisances(r)[1]
+
+    def _take_off_motion(self) -> None:
+        """From a sensor that feels more than half of its tool's own motion all of it:
+        that is too much for a nuisance, along whose slope a force may turn that slides
+        (16 times the noise where a peg came to rest)."""
+        if not self.sensors:
+            return
+        n, r = self.nuisances(), self.base()
+        screen = Screen(r, n.columns, n.prior, np.ones(len(r), bool), reach=n.reach)
+        by_name = dict(zip(n.names, screen.fit_nuisances(r)[0], strict=True))
+        felt = [s for s in self.sensors if by_name.get(_felt_by(s), 0.0) < -0.5]
+        for sensor in felt:
+            self.means.wrench[:, sensor.rows] -= self._motion_felt_by(sensor)
+        if felt:
+            self._set(self.allowance)
+            self._shown = self.counts()
+            self._share_out(self.left())
+
+    def _motion_felt_by(self, sensor: WrenchSensor) -> np.ndarray:
+        """(K, n) what a sensor reads of its tool's motion if it feels all of it."""
+        m, row = self.means, self.means.centre
+        return felt_motion(
+            self.dynamics, sensor.frame, self._q[row], self._v[row], m.acceleration
+        )[:, : len(sensor.names)]
 
     # ----- What models are off by
 
@@ -219,15 +244,12 @@ class ContactProblem(ContactCandidates, GapProblem):
         for sensor in self.sensors:
             at, kept, forces = sensor.place, self.means.wrench, sensor.forces
             ripple = self._ripple(sensor.welded)
-            m, row = self.means, self.means.centre
-            motion = felt_motion(
-                self.dynamics, sensor.frame, self._q[row], self._v[row], m.acceleration
-            )[:, : len(sensor.names)]
+            motion = self._motion_felt_by(sensor)
             for name, own, more, step, size in (
                 (f"gain of {at}", sensor.rows, kept[:, sensor.rows], 0.01, FELT),
                 (f"ripple of {at}", forces, ripple, 1e-4, self._row_sec()),
                 # From none of it, of a sensor at the tip, to all, of one in the mount.
-                (f"inertia felt by {at}", sensor.rows, motion, 1.0, 1.0),
+                (_felt_by(sensor), sensor.rows, motion, 1.0, 1.0),
             ):
                 self.means.wrench = np.array(kept)
                 self.means.wrench[:, own] += step * more
@@ -547,3 +569,8 @@ class ContactProblem(ContactCandidates, GapProblem):
             series_of(model, before, after, held),
             unexplained_in_windows(model, after),
         )
+
+
+def _felt_by(sensor: WrenchSensor) -> str:
+    """The name of a nuisance."""
+    return f"inertia felt by {sensor.place}"
