@@ -210,12 +210,29 @@ def test_a_hull_has_spheres_within_its_largest_faces(tmp_path):
     assert len(inner) == 12 + 6 * 4
 
 
-def with_brick(scene, folder, effects=()):
-    """The scene with a box of 0.2 x 0.1 x 0.06 m in the place of the cube."""
+def test_a_capsule_touches_with_its_two_ends(scene, tmp_path):
+    """Tilted by a, its lowest point is half its length times sin(a), and its radius,
+    below its middle."""
+    rod = "<capsule><radius>0.02</radius><length>0.1</length></capsule>"
+    numbers = FreeBodyScene(with_brick(scene, tmp_path, shape=rod))
+    body, a = numbers.body(), 0.3
+    assert numbers.has_faces  # At the edge of a table other points would touch.
+    top = body.fixed[0, 11] + body.fixed[0, 14]
+    turn = 0.5 * (0.5 * np.pi - a)
+    pose = np.array([np.cos(turn), np.sin(turn), 0, 0, 0, 0, top + 0.5])
+    want = 0.5 - 0.05 * np.sin(a) - 0.02
+    assert lowest_gap(body, pose) == pytest.approx(want, abs=1e-12)
+
+
+BRICK = "<box><size>0.2 0.1 0.06</size></box>"
+
+
+def with_brick(scene, folder, effects=(), shape=BRICK):
+    """The scene with a box of 0.2 x 0.1 x 0.06 m, or another shape, in the place of the
+    cube."""
     (folder / "brick.sdf").write_text(
         '<sdf version="1.9"><model name="brick"><link name="brick"><collision name="c">'
-        "<geometry><box><size>0.2 0.1 0.06</size></box></geometry></collision></link>"
-        "</model></sdf>"
+        f"<geometry>{shape}</geometry></collision></link></model></sdf>"
     )
     brick = copy.deepcopy(scene.directives[-1])
     brick.add_model.name, brick.add_model.file = "brick", f"file://{folder}/brick.sdf"

@@ -5,9 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from makebreak.gap.data.conditioning import condition
+from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.numerics.free_body import FreeBody
+from makebreak.gap.residuals.contact import _patches
+from makebreak.gap.simulation.free_windows import FreeBodyModel
 from makebreak.gap.simulation.met_faces import met_faces
 from makebreak.gap.workflow import run_gap
+from makebreak.models.effects.kind import Effect
+from makebreak.models.scene import read_scene
 
 MASS, RADIUS, STIFFNESS, G, NOISE = 0.1, 0.04, 2e5, 9.81, 2e-4
 SPRING = "drake:point_contact_stiffness"  # Two in series.
@@ -89,6 +95,18 @@ def test_a_wall_that_a_ball_meets_elsewhere_is_named_with_how_far(tmp_path, off)
     # Lower or higher it would stand in the ball's way as before.
     assert not effect.indistinguishable_from
     assert result.verdict == "gap_named"
+
+
+def test_a_wall_that_is_run_against_is_not_searched_for_patches_of_friction(tmp_path):
+    """Patches are of level ground; their search takes most of the time."""
+    log = write_log(tmp_path, 0.0)
+    recordings, _ = condition(read_recordings([log]), False)
+    model = FreeBodyModel(read_scene(write_scene(tmp_path)), recordings)
+    assert {at for at, _ in model.met} == {"wall.wall"}
+    mu = Effect("contact_friction", ["ball.ball~wall.wall"], {"friction": 0.3})
+    runs = model.runs
+    assert _patches(model, "ball.ball~wall.wall", [mu], np.ones(3)) == []
+    assert model.runs == runs
 
 
 def test_a_wall_where_the_scene_has_it_is_no_gap(tmp_path):

@@ -200,6 +200,9 @@ def _patches(model, at: str, there, r) -> list[Candidate]:
     by one, and a rectangle is the sum of its cells."""
     if not isinstance(model, FreeBodyModel):
         return []
+    axes = _met_axes(model, at.split("~")[1])
+    if axes and "z" not in axes:
+        return []
     try:
         mu = model.dynamics.now("contact_friction", [at])["friction"]
         model.dynamics.now("friction_patch", [at])  # Whether there can be one.

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from pydrake.geometry import Box, Cylinder, HalfSpace, Sphere
+from pydrake.geometry import Box, Capsule, Cylinder, HalfSpace, Sphere
 from pydrake.math import RollPitchYaw
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, RigidBody
@@ -28,8 +28,10 @@ from makebreak.models.effects.kind import Effect, check_parameters, full_name
 from makebreak.models.effects.rolling_resistance import FADE_RATE
 from makebreak.models.scene import LoadedScene, Scene, load_scene
 
-# What a sphere is: the body's own, or stands in for a corner, a face or a round edge.
-SPHERE, CORNER, WITHIN, ROUND = range(4)
+# What a sphere is: the body's own, or stands in for a corner, a face or a round edge;
+# or it is an end of a rod (a capsule), of which no other point is the first to meet a
+# face.
+SPHERE, CORNER, WITHIN, ROUND, ROD = range(5)
 # [m] As far a box may be above what it stands on; it goes on below a half-space.
 STANDS, BELOW = 1e-3, 1.0
 REST_DEPTH = 2e-5  # [m] Of a body on a face that is not stiffer than it need be.
@@ -80,7 +82,8 @@ class FreeBodyScene:
     without another plant, which would take longer than all windows' steps.
 
     A box, a cylinder or a hull of the body touches with spheres at its corners and
-    within its faces (face_supports.py), as an area would and Drake's point does not.
+    within its faces (face_supports.py), as an area would and Drake's point does not; a
+    capsule with its two ends.
 
     Args: on_side: whether a cylinder of it lies on its side. of: the loaded scene, and
         which of its free bodies, if there are several.
@@ -187,6 +190,9 @@ class FreeBodyScene:
             shape, X = inspector.GetShape(g), inspector.GetPoseInFrame(g)
             if isinstance(shape, Sphere):
                 each = [(SPHERE, [0.0, 0.0, 0.0, shape.radius()])]
+            elif isinstance(shape, Capsule):
+                ends = (-0.5 * shape.length(), 0.5 * shape.length())
+                each = [(ROD, [0.0, 0.0, z, shape.radius()]) for z in ends]
             else:
                 corners = centres_of(shape, self._on_side, POINT)
                 if corners is None:
