@@ -10,6 +10,7 @@ from makebreak.gap.numerics.permitted_forces import (
     nonnegative,
     roots_of,
     tangential,
+    tangents,
     unshared_load,
 )
 
@@ -177,3 +178,24 @@ def test_means_of_a_held_signal_are_its_integral():
         expected.append(np.sum(w * held) / np.sum(w))
     got = permitted_forces.held_means(t, centres, half) @ y
     np.testing.assert_allclose(got, expected, atol=1e-3)
+
+
+def test_directions_across_a_normal_turn_with_it():
+    """A cone is a mean over a while. Directions that jumped as a normal turned through
+    44 degrees took the friction of a tool away for as long."""
+    angle = np.radians(np.linspace(30.0, 330.0, 301))
+    z = np.full(len(angle), 0.02)
+    ways = [[np.cos(angle), np.sin(angle), z], [z, np.cos(angle), np.sin(angle)]]
+    some = np.random.default_rng(0).normal(size=(50, 3))
+    for normal in (*(np.transpose(each) for each in ways), some, np.eye(3)):
+        n = normal / np.linalg.norm(normal, axis=1)[:, None]
+        e1, e2 = tangents(n)
+        frames = np.stack([n, e1, e2], axis=1)
+        square = frames @ frames.transpose(0, 2, 1)
+        np.testing.assert_allclose(
+            square, np.tile(np.eye(3), (len(n), 1, 1)), atol=1e-12
+        )
+        if len(n) == len(angle):
+            steps = np.linalg.norm(np.diff(frames, axis=0), axis=2)
+            assert steps.max() < 1.1 * np.radians(1.0)
+    assert tangents(np.zeros((0, 3)))[0].shape == (0, 3)

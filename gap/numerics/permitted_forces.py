@@ -29,6 +29,7 @@ _SECOND_MOMENT = 1.0 / 11.0  # Of w, over the half width squared.
 # mean velocity, -integral(w' q), by their noise in a mean position.
 RATE_OF_MEAN = 34.0 / 7.0
 FEWEST = 6  # Samples within a test function.
+ALONG = 0.95  # Of a normal, along an axis to which nothing is across then.
 
 
 def tangential(u, normal):
@@ -37,8 +38,12 @@ def tangential(u, normal):
 
 
 def tangents(normal) -> tuple[np.ndarray, np.ndarray]:
-    """Two unit vectors (n, 3) across unit normals (n, 3), and each other."""
-    across = np.where(np.abs(normal[:, :1]) > 0.7, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
+    """Two unit vectors (n, 3) across unit normals (n, 3), and each other. They turn
+    with the normals and do not jump: means of them are taken over a while. So they
+    follow from one axis, that which the normals are farthest from, as far as may be."""
+    axis = int(np.argmin(np.mean(normal**2, axis=0))) if len(normal) else 0
+    one, other = np.eye(3)[axis], np.eye(3)[axis - 1]
+    across = np.where(np.abs(normal[:, [axis]]) > ALONG, other, one)
     e1 = np.cross(normal, across)
     e1 /= np.linalg.norm(e1, axis=1)[:, None]
     return e1, np.cross(normal, e1)
