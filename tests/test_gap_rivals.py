@@ -3,10 +3,16 @@
 from types import SimpleNamespace
 
 import pytest
+from gap_benchmark import contact_cases
 
+from makebreak.gap.data.reading import read_recordings
+from makebreak.gap.data.split import split
+from makebreak.gap.residuals.contact_problem import ContactProblem
 from makebreak.gap.search import rivals
 from makebreak.gap.search.choice import Trial
+from makebreak.gap.search.select import select
 from makebreak.models.effects.kind import Effect
+from makebreak.models.scene import read_scene
 
 FRICTION = Effect("contact_friction", ["disc.disc~table.table"], {"friction": 0.45})
 MASS = Effect("object_mass", ["disc.disc"], {"mass": 0.7})
@@ -37,3 +43,18 @@ def test_two_of_which_one_goes_to_the_end_of_its_range_are_not_compared(
     one, other = trial(FRICTION), trial(MASS)
     together = rivals.Rivals(search).together([], one, other)  # type: ignore[arg-type]
     assert together is (found if known else None)
+
+
+def test_a_mass_and_a_friction_that_nearly_cancel_are_both_named(tmp_path):
+    """A block that is lighter by a third on a table that is rougher by half: each alone
+    changes little, and beside either alone a lower table is needed more."""
+    case = contact_cases.contact_cases("contact-final", 1015000)[13]
+    truth = contact_cases.write(case, tmp_path)
+    scene = read_scene(tmp_path / "scene.yaml")
+    recordings = split(read_recordings([tmp_path / "recording.csv"])).decided
+    selection = select(ContactProblem(scene, recordings))
+    found = {c.effect.kind: c.effect.parameters for c in selection.choices}
+    assert set(found) == {"object_mass", "contact_friction"}
+    for effect in truth["effects"]:
+        for name, value in effect["parameters"].items():
+            assert found[effect["kind"]][name] == pytest.approx(value, rel=0.03)

@@ -82,9 +82,11 @@ def add_next(
         return none
     base = screen.evaluate(current.r)
     trials = without_doubles(search, trials)
-    pick = pick_simplest(search, trials, found, base.score)
-    pick = rivals.needed(trials, pick, chosen)
-    pair = _pair(search, rivals, (wide, screen), chosen, ranked, trials, pick)
+    first = pick_simplest(search, trials, found, base.score)
+    pick = rivals.needed(trials, first, chosen)
+    # Where two effects nearly cancel a third may be needed beside each of them alone.
+    both = rivals.both_needed(trials, (first, pick), chosen)
+    pair = _pair(search, both, (wide, screen), chosen, ranked, trials, pick)
     if pair is not None:
         trials.append(pair)
         pick = len(trials) - 1
@@ -160,14 +162,13 @@ def _fitted_exactly(
 
 
 def _pair(
-    search: Comparison, rivals: Rivals, screens: tuple[Screen, Screen],
+    search: Comparison, both: Ranked | None, screens: tuple[Screen, Screen],
     chosen: Sequence[Choice], ranked: Sequence[Ranked], trials: Sequence[Trial],
     pick: int,
 ) -> Trial | None:  # fmt: skip
-    """Two effects in the place of the one that is picked: it and a rival that are both
+    """Two effects in the place of the one that is picked: two rivals that are `both`
     needed, else two others that leave clearly less."""
     wide, screen = screens
-    both = rivals.both_needed(trials, pick, chosen)
     if both is not None:
         for trial in fit_each(search, screen, chosen, [both]):
             return trial

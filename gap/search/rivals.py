@@ -107,24 +107,27 @@ class Rivals:
         return pick
 
     def both_needed(
-        self, trials: Sequence[Trial], pick: int, chosen: Sequence[Choice]
+        self, trials: Sequence[Trial], picks: Sequence[int], chosen: Sequence[Choice]
     ) -> Ranked | None:
-        """The one that is picked and a rival, each of which is needed beside the other;
-        of several such pairs the one that leaves least. (One of them may do it alone
-        below the noise, where its value is then wrong.)"""
+        """One of those that were picked and a rival, each of which is needed beside the
+        other; of several such pairs the one that leaves least. (One of them may do it
+        alone below the noise, where its value is then wrong.)"""
         found = []
-        for k, other in enumerate(trials):
-            if k == pick or not are_rivals(trials[pick], other):
-                continue
-            both, least = self.together(chosen, trials[pick], other), self.least_lost()
-            if both is None or not (both.needs(0, least) and both.needs(1, least)):
-                continue
-            if self._gained_by_second(chosen, both) >= PAIR_GAIN:
-                found.append((rms(both.fitted.left), other.ranked, both))
+        for pick in dict.fromkeys(picks):
+            for k, other in enumerate(trials):
+                if k == pick or not are_rivals(trials[pick], other):
+                    continue
+                both = self.together(chosen, trials[pick], other)
+                least = self.least_lost()
+                if both is None or not (both.needs(0, least) and both.needs(1, least)):
+                    continue
+                if self._gained_by_second(chosen, both) >= PAIR_GAIN:
+                    found.append((rms(both.fitted.left), trials[pick], other, both))
         if not found:
             return None
-        _, rival, both = min(found, key=lambda each: each[0])
-        pair = pair_of(trials[pick].ranked, rival, both.fitted.effects[len(chosen) :])
+        _, one, other, both = min(found, key=lambda each: each[0])
+        effects = both.fitted.effects[len(chosen) :]
+        pair = pair_of(one.ranked, other.ranked, effects)
         self._pairs.append(pair)
         return pair
 
