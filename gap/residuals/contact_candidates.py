@@ -20,6 +20,7 @@ from makebreak.gap.residuals.contact_rows import ContactRows
 from makebreak.gap.simulation.windows import LARGEST
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
+from makebreak.models.effects.ground import PLACE
 from makebreak.models.effects.kind import Effect
 
 CELL, MOST_CELLS = 0.015, 20  # A side of the cells in which a patch is looked for [m].
@@ -37,6 +38,7 @@ BESIDE, BEYOND = 0.01, 0.05
 FRICTIONS, MASSES = (0.85, 1.3, 0.5, 2.0), (0.85, 1.2, 0.6, 1.6)
 SIZES = (0.03, -0.03, 0.1, -0.1)  # Likewise, and added to 1.
 OFFSETS = (2e-3, 0.01, -0.01)  # Of a centre of mass [m].
+SHIFT = 1e-3  # Of a wall [m].
 (BIAS,) = (name for name, kind in KINDS.items() if kind.channel == "bias")
 SMALL = 0.1  # First trial of an effect on joints, of the efforts there.
 
@@ -125,9 +127,25 @@ class ContactCandidates(ContactRows):
             yield "plane_tilt", at, 2, ("roll", "pitch"), (), steps
         for at in self.dynamics.places("plane_height"):
             yield "plane_height", at, 1, ("height",), (), [[(1e-3, {"height": 1e-3})]]
+        for body, axes in self._walls_met().items():
+            zero = dict.fromkeys(axes, 0.0)
+            trial = [(SHIFT, {**zero, a: SHIFT}) for a in axes]
+            yield PLACE, self.shapes.names[body], len(axes), axes, (), [trial]
         for at, bias in self.biased.items():
             yield BIAS, at, 1, ("bias",), (), [[(bias, {"bias": bias})]]
         yield from self._of_mechanism()
+
+    def _walls_met(self) -> dict[int, tuple[str, ...]]:
+        """{fixed body: axes of the world along which what moves freely meets it}, but
+        for what carries it."""
+        found: dict[int, set[str]] = {}
+        for s, on in zip(self.slots, self._masks, strict=True):
+            pair = self._pair_of(s)
+            if on.any() and self._is_of_a_free_body(pair) and not self._lies(pair):
+                (body,) = set(pair) & self.shapes.anchored
+                axis = int(np.argmax(np.abs(s.normal[on]).mean(axis=0)))
+                found.setdefault(body, set()).add("xyz"[axis])
+        return {k: tuple(sorted(axes)) for k, axes in found.items()}
 
     def _friction_now(self, pair) -> float:
         """Of the slots that act."""

@@ -25,6 +25,7 @@ from makebreak.gap.residuals.contact_means import FEWEST_MEANS, SLIDES, ContactM
 from makebreak.gap.residuals.touching import BESIDE, MEETS, NEAR
 from makebreak.gap.simulation.contact_shapes import Slot
 from makebreak.gap.simulation.windows import TURN
+from makebreak.models.effects.ground import PLACE
 from makebreak.models.effects.kind import Effect
 from makebreak.models.effects.loads import rotation
 from makebreak.models.scene import Scene
@@ -41,7 +42,7 @@ PYRAMID = 12  # Sides about a friction cone.
 MOST_SHARED = 6  # Rows that share loads.
 # What changes shapes, surfaces and where they are.
 SURFACES = (
-    "contact_friction", "friction_patch", "plane_tilt", "plane_height", "wall_position",
+    "contact_friction", "friction_patch", "plane_tilt", "plane_height", PLACE,
     "object_size",
 )  # fmt: skip
 MOST_KEPT = 12  # Geometries.
@@ -85,7 +86,7 @@ class PermittedContacts(ContactMeans):
     """Generators of contact forces at the nodes of the test functions."""
 
     # Kinds that move points and surfaces of what lies or is pushed.
-    moves: tuple[str, ...] = ("plane_tilt", "plane_height", "object_size")
+    moves: tuple[str, ...] = ("plane_tilt", "plane_height", PLACE, "object_size")
 
     def __init__(self, scene: Scene, recordings: Sequence[Recording]):
         super().__init__(scene, recordings)
@@ -173,13 +174,15 @@ class PermittedContacts(ContactMeans):
                 for k in poses:
                     if self._is_at(e, k):
                         shapes = shapes.scaled(k, self._scale_of(e, k))
-            if e.kind not in ("plane_tilt", "plane_height"):
+            if e.kind not in ("plane_tilt", "plane_height", PLACE):
                 continue
             for k in poses:
                 if k in self.shapes.anchored and self._is_at(e, k):
                     R, p = poses[k]
                     if e.kind == "plane_height":
                         poses[k] = R, p + [0.0, 0.0, e.parameters["height"]]
+                    elif e.kind == PLACE:
+                        poses[k] = R, p + [e.parameters.get(a, 0.0) for a in "xyz"]
                     else:
                         poses[k] = rotation(e).matrix() @ R, p
         for k in poses if shift else ():
