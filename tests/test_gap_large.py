@@ -12,11 +12,15 @@ from scipy.spatial.transform import Rotation
 from makebreak.gap import run_gap
 from makebreak.gap.data.check_meshes import check_meshes
 from makebreak.gap.data.reading import read_recordings
+from makebreak.gap.fit import fit_effects
 from makebreak.gap.numerics.edge_crossings import FAR, crossing, edges_of_box
 from makebreak.gap.numerics.free_body import FreeBody, simulate
 from makebreak.gap.residuals.contact_dynamics import ContactDynamics
+from makebreak.gap.residuals.contact_problem import ContactProblem
 from makebreak.gap.residuals.pressing import PressingProblem
 from makebreak.gap.result import GapMeasure
+from makebreak.gap.search.comparison import Comparison
+from makebreak.gap.search.screen import rank
 from makebreak.gap.simulation.contact_shapes import ContactShapes
 from makebreak.gap.verdict import after_simulation
 from makebreak.models.scene import load_scene, read_scene
@@ -198,6 +202,34 @@ def test_a_hole_that_stands_elsewhere_was_passed_through_the_walls_that_are_open
     [(body, off)] = problem.off.items()
     assert problem.shapes.names[body] == "socket.socket"
     assert off == pytest.approx({"x": 2.59e-3, "y": -5.71e-3}, abs=1e-4)
+
+
+@pytest.mark.parametrize("seed, y", [(15, 6.89e-3), (20, -5.11e-3)])
+def test_a_wall_stands_where_what_is_pushed_meets_it(tmp_path, seed, y):
+    """Farther away it was gone through; nearer nothing touches it in the scene."""
+    problem = problem_of(tmp_path, ContactProblem, "corner", seed, most=1, hide="wall")
+    search = Comparison(problem, lambda text: None)
+    start = fit_effects(problem, search.screen(problem.base()), ())
+    [wall] = [
+        c for c in problem.next_candidates(start)
+        if (c.kind, c.at) == ("wall_position", ("north.north",))
+    ]  # fmt: skip
+    [ranked] = rank(search.screen(start.r), [wall])
+    fit = fit_effects(problem, search.screen(start.r), ranked.effects)
+    assert fit.effects[0].parameters == pytest.approx({"y": y}, abs=5e-4)
+    assert fit.score < 0.7 * start.score
+
+
+def test_a_body_that_stops_in_front_of_a_wall_touches_it_only_if_that_is_felt(
+    tmp_path, monkeypatch
+):
+    """Of the same motion, with forces that need no wall."""
+    felt = problem_of(tmp_path, ContactProblem, "corner", 20, most=1, hide="wall")
+    assert len(felt._met_at) == 1
+    monkeypatch.setattr(
+        ContactProblem, "_mean_squares", lambda self, *a: np.ones(len(self.means.time))
+    )
+    assert not type(felt)(felt.scene, felt.recordings)._met_at
 
 
 # ----- Meshes

@@ -127,10 +127,10 @@ class ContactCandidates(ContactRows):
             yield "plane_tilt", at, 2, ("roll", "pitch"), (), steps
         for at in self.dynamics.places("plane_height"):
             yield "plane_height", at, 1, ("height",), (), [[(1e-3, {"height": 1e-3})]]
-        for body, axes in self._walls_met().items():
+        for wall, axes in self._walls_met().items():
             zero = dict.fromkeys(axes, 0.0)
-            trial = [(SHIFT, {**zero, a: SHIFT}) for a in axes]
-            yield PLACE, self.shapes.names[body], len(axes), axes, (), [trial]
+            steps = [[(SHIFT, {**zero, a: SHIFT}) for a in axes]]
+            yield PLACE, self.shapes.names[wall], len(axes), axes, (), steps
         for at, bias in self.biased.items():
             yield BIAS, at, 1, ("bias",), (), [[(bias, {"bias": bias})]]
         yield from self._of_mechanism()

@@ -7,14 +7,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from makebreak.gap.residuals.contact_dynamics import ContactDynamics
+from makebreak.gap.residuals.felt_walls import FeltWalls
 from makebreak.gap.simulation.windows import LARGEST
 from makebreak.models.effects.kind import Effect
 
 BLOCK_SEC = 0.6  # In which a tool goes a few centimetres.
 
 
-class ContactRows(ContactDynamics):
+class ContactRows(FeltWalls):
     """Rows (m,) out of the table (K, n) of ContactDynamics.left()."""
 
     # Which of the table are rows (K, n); which test functions are fitted, and the block

@@ -251,7 +251,9 @@ class FeltPlaces(FixedFaces):
                         trial = self._completed(trial, rest, looks_ahead=False)
                     still = self._deep_nodes(trial).get(body, 0) > STILL_DEEP * deep
                     places = sum(map(len, trial.values()))
-                    return still, self._mean_squares(trial).sum() / WHOLE**places
+                    return still, self._mean_squares(
+                        self._displacing(trial)
+                    ).sum() / WHOLE**places
 
                 best = min(ways, key=quality) if len(ways) > 1 else ways[0]
                 off, left = self._with(off, best), rest
@@ -304,7 +306,7 @@ class FeltPlaces(FixedFaces):
         self, left: Sequence[Face], off: dict[int, dict[str, float]]
     ) -> Face | None:
         """The face that explains most, of those that are felt."""
-        before = self._mean_squares(off)
+        before = self._mean_squares(self._displacing(off))
         best, gain = None, 0.0
         for face in left:
             if not self._is_of(face, off):
@@ -317,7 +319,7 @@ class FeltPlaces(FixedFaces):
                     on |= self._when(geometry, s) > 0.999
             if on.sum() < FEWEST_SEEN:
                 continue
-            after = self._mean_squares(trial)
+            after = self._mean_squares(self._displacing(trial))
             is_felt = before[on].mean() >= FELT
             if not (is_felt and after[on].mean() <= LESS * before[on].mean()):
                 continue
@@ -366,17 +368,6 @@ class FeltPlaces(FixedFaces):
     def _add(self, off: dict[int, dict[str, float]], face: Face) -> None:
         by = off.setdefault(face.body, {})
         by[AXES[face.axis]] = face.off / float(face.normal[face.axis])
-
-    def _mean_squares(self, off) -> np.ndarray:
-        """(K,) of what equations and wrenches leave with bodies displaced."""
-        needs = self._all_needs(())
-        G, there, _, _, sharing = self._generators(self._displacing(off))
-        left = np.zeros_like(needs)
-        explain(
-            needs, G, there, self.root, sharing, left,
-            np.zeros((len(left), there.shape[1])), np.zeros(len(left), np.int64),
-        )  # fmt: skip
-        return np.mean(left**2, axis=1)
 
     def _pressing(self, effects: Sequence[Effect] = ()):
         """Where bodies may really be: {pair: (K,) the sum of its normal forces over how

@@ -41,6 +41,8 @@ class Touching(SceneMotion):
         # {bodies: how far apart (n_rows,) [m]} of contacts that a sensor feels.
         self._apart: dict[tuple[int, ...], np.ndarray] = {}
         self.biased: dict[str, float] = {}
+        # {bodies: where they meet, by what is felt, if not at 0 [m]}.
+        self._met_at: dict[tuple[int, int], float] = {}
         self._touching = self._touching_rows()
 
     def _pair_of(self, s: Slot) -> tuple[int, int]:
@@ -70,12 +72,7 @@ class Touching(SceneMotion):
         distance = self._least_distances()
         found: dict[tuple[int, ...], np.ndarray] = {}
         for key, phi in distance.items():
-            rate = np.concatenate([
-                np.gradient(phi[a:b], t.time)
-                for a, b, t in zip(self._offset, self._offset[1:], self.tracks,
-                                   strict=False)
-            ])  # fmt: skip
-            found[key] = (phi < MEETS) & (np.abs(rate) < APPROACH)
+            found[key] = (phi < MEETS) & (np.abs(self._rate(phi)) < APPROACH)
         for sensor in self.sensors:
             welded = set(sensor.welded)
             keys = [key for key in distance if set(key) & welded]
@@ -90,6 +87,11 @@ class Touching(SceneMotion):
                     found[key] = self._without_short_losses(felt)
                     self._apart[key] = distance[key]
         return found
+
+    def _rate(self, phi: np.ndarray) -> np.ndarray:
+        """(n_rows,) of a distance (n_rows,) in each episode [m/s]."""
+        of_each = zip(self._offset, self._offset[1:], self.tracks, strict=False)
+        return np.concatenate([np.gradient(phi[a:b], t.time) for a, b, t in of_each])
 
     def _least_distances(self) -> dict[tuple[int, ...], np.ndarray]:
         """{bodies, as of _touching_rows: (n_rows,) distance of their nearest points
