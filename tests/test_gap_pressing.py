@@ -821,7 +821,7 @@ def test_the_inertia_that_a_sensor_feels_is_a_slope_however_large_rows_are(tmp_p
 
 def test_what_a_sensor_in_the_mount_feels_of_its_tool_is_taken_off(right):
     """As a nuisance it was a slope, along which a force that slides turned out of its
-    cone: a right model left 16 times the noise where a peg came to rest."""
+    cone; a friction was found half as well."""
     scene, recordings, tip = right
     names = [f"gantry.tip.f{a}" for a in "xyz"]
     felt = []

@@ -125,8 +125,8 @@ class ContactProblem(ContactCandidates, GapProblem):
 
     def _take_off_motion(self) -> None:
         """From a sensor that feels more than half of its tool's own motion all of it:
-        that is too much for a nuisance, along whose slope a force may turn that slides
-        (16 times the noise where a peg came to rest)."""
+        that is too much for a nuisance, along whose slope a force that slides turns out
+        of its cone."""
         if not self.sensors:
             return
         n, r = self.nuisances(), self.base()
