@@ -1173,7 +1173,9 @@ def test_a_refit_along_what_fitted_rows_do_not_tell_is_not_taken(
         return SimpleNamespace(effects=(effect,), score=still, r=screen)
 
     search = object.__new__(Comparison)
-    search.problem = SimpleNamespace(residual=lambda effects: 2.0 * left)
+    search.problem = SimpleNamespace(
+        residual=lambda effects: 2.0 * left, permitted=list
+    )
     search.error = lambda error: error
     search.screen = lambda r, scale: r
     monkeypatch.setattr(comparison, "fit_effects", fit)
