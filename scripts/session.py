@@ -243,9 +243,11 @@ class Session:
                     done = sample(t)
                     stream.tick(root)
                     bar.update(t - bar.n)
-                    interrupt.hit |= buttons.stopped(
+                    # Not `|=`: a Ctrl-C while it is asked would be overwritten.
+                    if buttons.stopped(
                         lambda: interrupt.hit, simulator.ResetStatistics
-                    )
+                    ):
+                        interrupt.hit = True
                 if (done or interrupt.hit) and time[-1] < duration:
                     why = "interrupted" if interrupt.hit else done
                     self.endings.append(_ending(label, time[-1], duration, why))

@@ -21,6 +21,7 @@ from pydrake.systems.primitives import ConstantVectorSource, Integrator
 
 from makebreak.gap.data.table import check_columns, write_recording
 from makebreak.scripts.compiling import FIRST, CompilingShown
+from makebreak.scripts.run_buttons import RunButtons
 from makebreak.scripts.session import Session
 from makebreak.scripts.settings import (
     apply_settings,
@@ -234,6 +235,19 @@ def test_ctrl_c_ends_the_simulation_and_forbids_the_next(tmp_path, number):
     assert signal.getsignal(number) is before
     with pytest.raises(KeyboardInterrupt):
         own.simulate(diagram, 1.0, {})
+
+
+def test_ctrl_c_while_buttons_are_asked_ends_the_run(tmp_path, monkeypatch):
+    """It was overwritten by their answer: the run went on."""
+
+    def stopped(self, interrupted, restart):
+        signal.raise_signal(signal.SIGINT)
+        return False
+
+    monkeypatch.setattr(RunButtons, "stopped", stopped)
+    own, (diagram, _) = session(tmp_path), ramp()
+    log = own.simulate(diagram, 1.0, {"q": diagram.GetOutputPort("q")}, 0.1)
+    assert log.interrupted and log.time[-1] == pytest.approx(0.1)
 
 
 def test_ctrl_c_while_the_log_is_put_together_is_not_lost(tmp_path, monkeypatch):
