@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ball_table import write_ball_table
 from gap_benchmark.cases import cases, make, write
 
 from makebreak.gap.residuals.contact import CELLS, _patch_search
@@ -61,12 +62,7 @@ def rolled(folder: Path, tilt: float) -> Path:
         z = RADIUS / np.cos(tilt) - p[:, 0] * np.tan(tilt) - 0.1 * G / 2e5
         place = np.column_stack([p, z]) + NOISE * rng.normal(size=(len(t), 3))
         rows.append(np.column_stack([t, np.full(len(t), episode), place]))
-    file = folder / "rolled.csv"
-    np.savetxt(
-        file, np.concatenate(rows), delimiter=",", comments="", fmt="%.9g",
-        header="time,episode,ball.ball.x,ball.ball.y,ball.ball.z",
-    )  # fmt: skip
-    return file
+    return write_ball_table(folder / "rolled.csv", rows)
 
 
 def test_a_table_tilted_by_a_hundredth_of_a_degree_shows_over_whole_episodes(tmp_path):

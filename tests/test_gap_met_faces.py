@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ball_table import write_ball_table
 
 from makebreak.gap.data.conditioning import condition
 from makebreak.gap.data.reading import read_recordings
@@ -73,16 +74,7 @@ def write_log(folder: Path, off: float) -> Path:
         z = np.full(len(t), RADIUS - MASS * G / STIFFNESS)
         place = np.column_stack([x, y, z]) + NOISE * rng.normal(size=(len(t), 3))
         rows.append(np.column_stack([t, np.full(len(t), episode), place]))
-    return write_rows(folder, rows)
-
-
-def write_rows(folder: Path, rows: list[np.ndarray]) -> Path:
-    file = folder / "log.csv"
-    np.savetxt(
-        file, np.concatenate(rows), delimiter=",", comments="", fmt="%.9g",
-        header="time,episode,ball.ball.x,ball.ball.y,ball.ball.z",
-    )  # fmt: skip
-    return file
+    return write_ball_table(folder / "log.csv", rows)
 
 
 @pytest.mark.parametrize("off", [0.012, -0.06])
@@ -128,7 +120,9 @@ def test_a_friction_of_which_the_scene_has_none_is_found(tmp_path):
         place[:, 2] = RADIUS - MASS * G / STIFFNESS
         place += NOISE * rng.normal(size=place.shape)
         rows.append(np.column_stack([t, np.full(len(t), episode), place]))
-    result = run_gap(write_scene(tmp_path), [write_rows(tmp_path, rows)])
+    result = run_gap(
+        write_scene(tmp_path), [write_ball_table(tmp_path / "log.csv", rows)]
+    )
     (effect,) = result.effects
     assert effect.kind == "contact_friction"
     # The last fifth of each is held out.

@@ -44,7 +44,7 @@ _POSITIVE = dict.fromkeys(
 _SIZES = (0.95, 0.99, 1.05)
 _DAMPED = (0.02, 0.06, 0.12, 0.25, 0.5)  # Of critical damping: a linear damper's.
 _INERTIAS = (0.97, 1.2)
-_PLACES = (-0.02, -0.008, -0.003, 0.003, 0.008, 0.02)  # Of a face that is met [m].
+PLACES = (-0.02, -0.008, -0.003, 0.003, 0.008, 0.02)  # Of a face that is met [m].
 # Cells a side of the ground that was touched, in search of a patch; their least size.
 CELLS, LEAST_CELL = 6, 0.01  # [m]
 # A side is moved by so many steps of so much of a cell, most often so many times.
@@ -161,7 +161,7 @@ def _trials(model, kind: str, at: str):
             if (axis == "z") == (kind == PLACE):
                 continue
             name = axis if kind == PLACE else "height"
-            values = [*_PLACES] if kind == PLACE else [*_PLUS[kind]["height"]]
+            values = [*PLACES] if kind == PLACE else [*_PLUS[kind]["height"]]
             if abs(off) > max(values):
                 values.append(off)
             yield [[(d, {name: d})] for d in values], (name,), ()

@@ -11,6 +11,7 @@ import numpy as np
 
 from makebreak.gap.numerics.permitted_forces import explain
 from makebreak.gap.residuals.contact_dynamics import SHAPED
+from makebreak.gap.residuals.felt_walls import FEWEST_SEEN, LESS
 from makebreak.gap.residuals.fixed_faces import (
     CLEAR,
     LEAST_FORCE,
@@ -27,9 +28,8 @@ from makebreak.gap.residuals.touching import MEETS
 from makebreak.gap.simulation.contact_shapes import Slot
 from makebreak.models.effects.kind import Effect
 
-FEWEST_SEEN = 3  # Test functions in which a face is pressed on.
 STILL_DEEP = 0.1  # Of the nodes at which it was: knocks go deeper, too.
-FELT, LESS = 4.0, 0.5  # Mean square of what is left where a face is felt; with it.
+FELT = 4.0  # Mean square of what is left where a face is felt.
 MOVES = ("wall_position", "plane_height")
 WHOLE = 0.9  # Of the squares left: one more place or friction must leave less.
 MOST_SLOTS = 12  # Places of a fixed body at which its distances are kept.
@@ -348,10 +348,8 @@ class FeltPlaces(FixedFaces):
         along = np.maximum(np.sum(pull * needs, axis=1), 0.0)
         taken = along**2 / np.maximum(np.sum(pull**2, axis=1), 1e-300)
 
-        def whole(rows) -> np.ndarray:
-            return np.asarray(self._W @ rows.astype(float)).ravel() > 0.999
-
-        at, above = whole(apart < MEETS), whole((apart > PASSED) & (apart < ABOVE))
+        at = self._wholly(apart < MEETS)
+        above = self._wholly((apart > PASSED) & (apart < ABOVE))
         if min(at.sum(), above.sum()) < FEWEST_SEEN:
             return False
         return bool(np.median(taken[above]) < GONE * np.median(taken[at]))

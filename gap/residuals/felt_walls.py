@@ -15,7 +15,7 @@ from makebreak.models.effects.kind import Effect
 
 FEWEST_ROWS = 5  # In which it stays at the wall.
 SAME = 5e-4  # Over which distances at the wall scatter [m].
-FEWEST_SEEN = 3  # Test functions.
+FEWEST_SEEN = 3  # Test functions in which a face is pressed on.
 # Of the mean square of what is left where a wall is met, what is left away from it at
 # most, but for a tenth of the test functions; and what a wall may leave of it.
 ELSEWHERE, MOST, LESS = 0.25, 0.9, 0.5
@@ -34,14 +34,17 @@ class FeltWalls(ContactDynamics):
                 continue
             pair = key[0], key[1]
             off = _kept(phi)
-            rows = (phi < off + MEETS) & (np.abs(self._rate(phi)) < APPROACH)
-            if not MEETS < off < NEAR or not self._may_be_felt(phi, off):
+            if not MEETS < off < NEAR:
                 continue
-            before = float(self._mean_squares()[self._wholly(rows)].mean())
+            left = self._mean_squares()
+            if not self._may_be_felt(left, phi, off):
+                continue
+            rows = (phi < off + MEETS) & (np.abs(self._rate(phi)) < APPROACH)
+            before = left[self._wholly(rows[self._rows])].mean()
             kept = self._touching[key]
             self._touching[key], self._met_at[pair] = rows, off
             self._find_again()
-            at = self._wholly(rows)
+            at = self._wholly(rows[self._rows])
             seen = at.sum() >= FEWEST_SEEN
             if not seen or self._mean_squares()[at].mean() > LESS * before:
                 self._touching[key] = kept
@@ -56,20 +59,17 @@ class FeltWalls(ContactDynamics):
         self._last = None
         super()._prepare()
 
-    def _wholly(self, rows: np.ndarray) -> np.ndarray:
-        """(K,) test functions all of whose rows are among (n_rows,) these."""
-        on = rows[self._rows].astype(float)
-        return np.asarray(self._W @ on).ravel() > 0.999
+    def _wholly(self, on: np.ndarray) -> np.ndarray:
+        """(K,) test functions all of whose nodes are among (n_nodes,) these."""
+        return np.asarray(self._W @ on.astype(float)).ravel() > 0.999
 
-    def _may_be_felt(self, phi: np.ndarray, off: float) -> bool:
-        """Whether more is left where the nearest points are as far from a wall as they
-        ever come than farther away: a friction or a mass that is wrong would be wrong
-        there, too."""
-        left = self._mean_squares()
-        at, away = (
-            self._wholly(phi < off + MEETS),
-            self._wholly(phi > off + 2.0 * MEETS),
-        )
+    def _may_be_felt(self, left: np.ndarray, phi: np.ndarray, off: float) -> bool:
+        """Whether more is left (K,) where the nearest points are as far from a wall as
+        they ever come than farther away: a friction or a mass that is wrong would be
+        wrong there, too."""
+        phi = phi[self._rows]
+        at = self._wholly(phi < off + MEETS)
+        away = self._wholly(phi > off + 2.0 * MEETS)
         if min(at.sum(), away.sum()) < FEWEST_SEEN:
             return False
         return bool(np.quantile(left[away], MOST) < ELSEWHERE * left[at].mean())

@@ -18,6 +18,7 @@ from makebreak.gap.data.recording import FEWEST_ROWS, Episode, Recording
 from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.numerics.runs import runs_of
 from makebreak.gap.problem import Candidate, Fitted, Nuisances, SearchPlan
+from makebreak.gap.residuals.contact import PLACES
 from makebreak.gap.residuals.contact_candidates import reader_of_trial
 from makebreak.gap.residuals.mechanism import link_changes
 from makebreak.gap.residuals.objects import WindowedProblem
@@ -44,7 +45,6 @@ DRAWS = 3  # Of uncertain starts.
 BLUR = 0.003  # Of how far a channel goes in a window: laws are no better.
 TRIED = (0.2, 0.4, 0.7, 0.9, 1.15, 1.7, 2.6, 4.5)  # Times what the scene has.
 DAMPED = (0.02, 0.06, 0.12, 0.25, 0.5, 1.0)  # Of critical damping: a linear damper's.
-PLACES = (-0.02, -0.008, -0.003, 0.003, 0.008, 0.02)  # Of a wall, tried [m].
 SMALL = 0.2  # First trial of an effect on joints, of the efforts there.
 REACH = 3.0
 LATE_SEC = 2.5e-4  # A velocity may come so much later than its position.
