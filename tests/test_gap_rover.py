@@ -1,15 +1,17 @@
 """A rover that drives and turns on wheels, which are cylinders in its model."""
 
 import csv
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.residuals.contact_problem import ContactProblem
-from makebreak.gap.residuals.lying_on_faces import point_on_face
+from makebreak.gap.residuals.lying_on_faces import lying_on_faces, point_on_face
 from makebreak.gap.simulation.commands import Commands
 from makebreak.gap.simulation.contact_windows import PushWindows
+from makebreak.gap.simulation.face_supports import LiesOn
 from makebreak.gap.simulation.scene_simulation import SceneSimulation
 from makebreak.models.scene import read_scene
 from makebreak.models.scene_schema import InitialSection
@@ -135,3 +137,20 @@ def test_wheels_touch_along_their_width(problem):
     given = problem.scene, problem.recordings, None
     assert rms(PushWindows(*given, lying)) < 1.2
     assert rms(PushWindows(*given, ())) > 2.0
+
+
+@pytest.mark.parametrize("fixed, stands", [({2}, True), (set(), False)])
+def test_only_on_what_is_fixed_links_touch_with_corners(fixed, stands):
+    """A link that a corner of another moving body meets is pushed, and lies on none."""
+    corner = SimpleNamespace(is_corner=True, rim=False, geometry=None)
+    slot = SimpleNamespace(a=1, b=2, key=(0, 0))
+    contacts = SimpleNamespace(
+        shapes=SimpleNamespace(
+            anchored=fixed, points=[corner], surfaces=[SimpleNamespace(geometry=None)]
+        ),
+        slots=[slot], _masks=[np.ones(3, bool)], _pairs_met=[],
+        _pair_of=lambda s: (s.a, s.b), _is_of_a_free_body=lambda pair: False,
+        scene=SimpleNamespace(plant=SimpleNamespace(contact_model="point")),
+    )  # fmt: skip
+    found = lying_on_faces(contacts)
+    assert found == [LiesOn(1, 2, is_tool=True)] * stands
