@@ -18,6 +18,7 @@ from makebreak.gap.numerics.free_body import FreeBody, simulate
 from makebreak.gap.residuals.contact_dynamics import ContactDynamics
 from makebreak.gap.residuals.contact_problem import ContactProblem
 from makebreak.gap.residuals.pressing import PressingProblem
+from makebreak.gap.residuals.touching import BESIDE, MEETS
 from makebreak.gap.result import GapMeasure
 from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.search.screen import rank
@@ -225,7 +226,13 @@ def test_a_body_that_stops_in_front_of_a_wall_touches_it_only_if_that_is_felt(
 ):
     """Of the same motion, with forces that need no wall."""
     felt = problem_of(tmp_path, ContactProblem, "corner", 20, most=1, hide="wall")
-    assert len(felt._met_at) == 1
+    [(pair, off)] = felt._met_at.items()
+    # What is left everywhere alike is no wall's force.
+    phi = felt._least_distances()[(*pair, BESIDE)]
+    alike = np.ones(len(felt.means.time))
+    there = felt._wholly((phi < off + MEETS)[felt._rows])
+    assert not felt._may_be_felt(alike, phi, off)
+    assert felt._may_be_felt(alike + 9.0 * there, phi, off)
     monkeypatch.setattr(
         ContactProblem, "_mean_squares", lambda self, *a: np.ones(len(self.means.time))
     )
