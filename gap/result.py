@@ -162,8 +162,10 @@ class GapMeasure:
     noise_floor: what a perfect model would leave. The noise that an error is divided
         by has in it how unsure its window's start is, so that this is 1.
     per_channel: {channel: {"before": , "after": }}, the same for each channel.
-    in_units: the same in the channels' own units. equations: of each joint's equation
-        of motion, where there are any: what the model leaves of its effort.
+    in_units: the same in the channels' own units. equations: of each equation of
+        motion, where there are any: what the model leaves of its effort or force.
+    in_equations: rms of the equations of motion over the noise, before and after, in
+        recordings that nothing was decided on; None where none was kept for that.
     n_windows: that were compared, failed: of them those that could not be simulated to
         their end, before and after. data: "reported" if neither a fit nor a choice saw
         them, "chosen on" else.
@@ -180,13 +182,23 @@ class GapMeasure:
     failed: tuple[int, int] = (0, 0)
     data: str = "reported"
     seconds: float = 0.0  # Of recording that were compared.
+    in_equations: tuple[float, float] | None = None
 
     @property
     def reduction(self) -> float:
+        """Share of what simulated windows show above the floor that is closed."""
+        return self._closed(self.before, self.after)
+
+    @property
+    def reduction_in_equations(self) -> float:
+        """The same of the equations of motion; nan where they were not asked."""
+        return self._closed(*self.in_equations) if self.in_equations else float("nan")
+
+    def _closed(self, before: float, after: float) -> float:
         """(before - after)/(before - floor); 0 where nothing was above the floor, and
         below the floor nothing counts."""
-        above = self.before - self.noise_floor
-        closed = self.before - max(self.after, self.noise_floor)
+        above = before - self.noise_floor
+        closed = before - max(after, self.noise_floor)
         return closed / above if above > 1e-9 else 0.0
 
 
@@ -282,6 +294,7 @@ class GapResult:
                 "windows_failed": list(self.gap.failed),
                 "in_units": {k: _plain(v) for k, v in self.gap.in_units.items()},
                 "equations": {k: _plain(v) for k, v in self.gap.equations.items()},
+                "in_equations": _in_equations_json(self.gap),
                 "per_channel": {
                     name: {k: _number(v) for k, v in each.items()}
                     for name, each in self.gap.per_channel.items()
@@ -305,6 +318,14 @@ class GapResult:
 
     def with_seconds(self, seconds: Mapping[str, float]) -> "GapResult":
         return replace(self, seconds=dict(seconds))
+
+
+def _in_equations_json(gap: GapMeasure) -> dict[str, Any] | None:
+    if gap.in_equations is None:
+        return None
+    before, after = map(_number, gap.in_equations)
+    reduction = _number(gap.reduction_in_equations)
+    return {"before": before, "after": after, "reduction": reduction}
 
 
 def _effect_json(each: NamedEffect) -> dict[str, Any]:

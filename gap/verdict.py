@@ -111,10 +111,14 @@ def two_figures(start: float, end: float, gap: GapMeasure) -> str:
     if not start > AGREEMENT_RMS_MAX or not gap.window_s > 0.0:
         return ""
     if gap.before <= AGREEMENT_RMS_MAX:
+        of = ""
+        if gap.in_equations and gap.in_equations[0] > AGREEMENT_RMS_MAX:
+            of = " of data held out for the report"
+            start, end = gap.in_equations
         return (
-            " Simulated windows do not show this gap; in the equations of motion the "
-            + (f"error falls from {figure(start)} to {figure(end)} times the noise."
-               if end < start else f"error is {figure(start)} times the noise.")
+            f" Simulated windows do not show this gap; in the equations of motion{of} "
+            + (f"the error falls from {figure(start)} to {figure(end)} times the noise."
+               if end < start else f"the error is {figure(start)} times the noise.")
         )  # fmt: skip
 
     equations, simulated = (

@@ -336,11 +336,7 @@ def conclude(
         verdict, differs = "gap_unnamed", why
     if verdict in ("gap_named", "ambiguous") and not _is_confirmed(final.gap):
         verdict = "gap_unnamed"
-        near += (
-            " On the data held out for the report the effects take the simulated "
-            f"error from {figure(final.gap.before)} to {figure(final.gap.after)}: "
-            "simulation does not confirm them."
-        )
+        near += _not_confirmed(final.gap)
     near += differs
     if selection.beyond:
         near += _beyond_limits(selection)
@@ -401,10 +397,30 @@ def _follows_noise(problem: GapProblem, selection: Selection) -> bool:
 
 def _is_confirmed(gap: GapMeasure) -> bool:
     """Whether simulated windows do better with what is named; where they show no gap
-    without it, whether they show none with it."""
-    if gap.before <= AGREEMENT_RMS_MAX:
-        return gap.after <= AGREEMENT_RMS_MAX
-    return gap.reduction >= CLOSED_SHARE_MIN
+    without it, whether they show none with it, and the equations of motion say the same
+    of what shows in them."""
+    if gap.before > AGREEMENT_RMS_MAX:
+        return gap.reduction >= CLOSED_SHARE_MIN
+    return gap.after <= AGREEMENT_RMS_MAX and _equations_confirm(gap)
+
+
+def _equations_confirm(gap: GapMeasure) -> bool:
+    if gap.in_equations is None:
+        return True
+    if max(gap.in_equations) <= AGREEMENT_RMS_MAX:
+        return True
+    return gap.reduction_in_equations >= CLOSED_SHARE_MIN
+
+
+def _not_confirmed(gap: GapMeasure) -> str:
+    """In words, that data held out for the report do not bear out what is named."""
+    by, (before, after) = "simulated error", (gap.before, gap.after)
+    if max(before, after) <= AGREEMENT_RMS_MAX and gap.in_equations is not None:
+        by, (before, after) = "error in the equations of motion", gap.in_equations
+    return (
+        f" On the data held out for the report the effects take the {by} from "
+        f"{figure(before)} to {figure(after)}: these data do not confirm them."
+    )
 
 
 def _nothing(start: float, end: float) -> GapMeasure:

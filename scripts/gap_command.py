@@ -229,5 +229,12 @@ def effects_table(result: GapResult) -> Table:
         f"held-out error: {g.before:.3g} before, {g.after:.3g} after, in units of the "
         f"noise (rms over {windows_of(result)}; a perfect model leaves 1)"
     )
+    notes = [note]
+    if g.in_equations:
+        before, after = g.in_equations
+        notes.append(
+            f"in the equations of motion of the same data: {before:.3g} before, "
+            f"{after:.3g} after"
+        )
     columns = ("effect", "at", "parameters", "next best")
-    return Table("\n".join(summary_lines(result)), columns, rows, notes=[note])
+    return Table("\n".join(summary_lines(result)), columns, rows, notes=notes)

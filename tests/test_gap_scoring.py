@@ -258,6 +258,29 @@ def test_what_windows_do_not_show_is_not_asked_to_be_closed_there():
     assert {r[0]: r[2] for r in table_of([hides]).rows}[name] == "- of 0 cases"
 
 
+def test_what_windows_do_not_show_is_asked_of_the_equations():
+    case = {"name": "c", "verdict": "gap_named", "ties": []}
+    case["effects"] = [{"kind": "object_mass", "at": "b.b", "parameters": {"mass": 2}}]
+    result = {"verdict": "gap_named", "effects": []}
+
+    def of(windows, share, equations):
+        gap = {"before": windows, "reduction": share, "in_equations": equations}
+        return score(case, {**result, "gap": gap})
+
+    shown = of(5.0, 0.8, {"before": 9.0, "reduction": 0.2})  # Windows come first.
+    hidden = of(0.9, 0.0, {"before": 9.0, "reduction": 0.6})
+    neither = of(0.9, 0.0, {"before": 1.2, "reduction": 1.0})
+    unasked = of(0.9, 0.0, None)
+    name = "the same, by held-out equations of motion where windows show less"
+    for scores, said in (
+        ([shown], "80% (80%)"),
+        ([hidden], "60% (60%)"),
+        ([neither], "0% (0%)"),
+        ([unasked], "0% (0%)"),
+    ):
+        assert {r[0]: r[2] for r in table_of(scores).rows}[name] == said
+
+
 def test_the_table_counts_and_names_what_went_wrong():
     scores = [a_score("gap_named", "gap_named", True, 0, 0.9, (0.02,))] * 9
     scores += [a_score("gap_named", "ambiguous", False, 1, 0.5, (0.3,))]

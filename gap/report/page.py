@@ -157,6 +157,10 @@ def _numbers(result: GapResult) -> str:
     cells += [("noise floor", number(g.noise_floor))]
     if closed and result.effects:
         cells.append(("of the gap closed", closed))
+    elif g.in_equations and result.effects:
+        closed = closed_share(*g.in_equations, g.noise_floor)
+        if closed:
+            cells.append(("closed in the equations of motion", closed))
     shown = "".join(
         f"<div><b>{value}</b><span>{name}</span></div>" for name, value in cells
     )

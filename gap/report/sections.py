@@ -141,8 +141,8 @@ def in_units(result: GapResult) -> str:
     body = f"<p>Rms over {windows_of(result)}.</p>" + _errors(result.gap.in_units)
     if result.gap.equations:
         body += (
-            "<p>Residual of each joint's equation of motion on the same data, with the "
-            "nuisance parameters fitted in both.</p>"
+            "<p>Residual of each equation of motion on the same data, with the "
+            "nuisance parameters in both.</p>"
         )
         body += _errors(result.gap.equations)
     return section("Errors in SI units", body)

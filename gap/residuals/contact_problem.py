@@ -30,6 +30,7 @@ from makebreak.gap.residuals.lying_on_faces import lying_on_faces
 from makebreak.gap.residuals.mechanism import link_changes
 from makebreak.gap.residuals.objects import unexplained_in_windows
 from makebreak.gap.residuals.permitted_contacts import Shift
+from makebreak.gap.residuals.pose_times import earlier
 from makebreak.gap.residuals.touching import ROBUST
 from makebreak.gap.residuals.widened_contacts import (
     distances_off,
@@ -37,7 +38,7 @@ from makebreak.gap.residuals.widened_contacts import (
     widened_contacts,
 )
 from makebreak.gap.residuals.wrench_sensor import WrenchSensor, felt_motion
-from makebreak.gap.result import Where
+from makebreak.gap.result import InUnits, Where
 from makebreak.gap.simulation.contact_windows import (
     LAW,
     PushWindows,
@@ -48,7 +49,7 @@ from makebreak.gap.simulation.face_supports import LiesOn
 from makebreak.gap.simulation.measure import gap_measure, series_of
 from makebreak.gap.thresholds import AGREEMENT_RMS_MAX
 from makebreak.models.effects import KINDS
-from makebreak.models.effects.kind import Effect
+from makebreak.models.effects.kind import Effect, sliding_joints
 from makebreak.models.scene import Scene
 
 PLACED = 1e-3  # A camera's place [m],
@@ -85,7 +86,16 @@ class ContactProblem(ContactCandidates, GapProblem):
         simulation_agrees=True,
     )
 
-    def __init__(self, scene: Scene, recordings: Sequence[Recording]):
+    def __init__(
+        self,
+        scene: Scene,
+        recordings: Sequence[Recording],
+        learned: "ContactProblem | None" = None,
+    ):
+        """Args: learned: a problem of the same scene with other recordings, of which
+        stays what models are off by and what sensors feel; None: both are learned of
+        these.
+        """
         self._scalable: dict[str, bool] = {}
         # By how much bodies' poses were moved earlier before this (late_poses.py) [s],
         # and the error before and with that.
@@ -99,7 +109,13 @@ class ContactProblem(ContactCandidates, GapProblem):
         # The model whose noise weighs all others'; None: each is weighed by its own.
         self._weights: Sequence[Effect] | None = None
         self._share_out(self.left())
-        self._take_off_motion()
+        # Those from which the tool's own motion is taken off, by the place of each.
+        self._feel_motion: tuple[str, ...] = ()
+        if learned is not None:
+            self._take_off_motion(learned._feel_motion)
+            self._set(learned.allowance)
+            return
+        self._take_off_motion(self._felt_motion())
         self._learn_misfit()
         # What is seen in few blocks may be loud only by the weights that were learned:
         # then these are shared out by them.
@@ -123,19 +139,25 @@ class ContactProblem(ContactCandidates, GapProblem):
         n, r = self.nuisances(), self.base()
         return Screen(r, n.columns, n.prior, np.ones(len(r), bool)).fit_nuisances(r)[1]
 
-    def _take_off_motion(self) -> None:
-        """From a sensor that feels more than half of its tool's own motion all of it:
-        that is too much for a nuisance, along whose slope a force that slides turns out
-        of its cone."""
+    def _felt_motion(self) -> tuple[str, ...]:
+        """Places of sensors that feel more than half of their tool's own motion."""
         if not self.sensors:
-            return
+            return ()
         n, r = self.nuisances(), self.base()
         screen = Screen(r, n.columns, n.prior, np.ones(len(r), bool), reach=n.reach)
         by_name = dict(zip(n.names, screen.fit_nuisances(r)[0], strict=True))
-        felt = [s for s in self.sensors if by_name.get(_felt_by(s), 0.0) < -0.5]
-        for sensor in felt:
-            self.means.wrench[:, sensor.rows] -= self._motion_felt_by(sensor)
-        if felt:
+        return tuple(
+            s.place for s in self.sensors if by_name.get(_felt_by(s), 0.0) < -0.5
+        )
+
+    def _take_off_motion(self, places: tuple[str, ...]) -> None:
+        """From sensors all of their tools' own motion: what is felt of it is too much
+        for a nuisance, along whose slope a force that slides turns out of its cone."""
+        self._feel_motion = places
+        for sensor in self.sensors:
+            if sensor.place in places:
+                self.means.wrench[:, sensor.rows] -= self._motion_felt_by(sensor)
+        if places:
             self._set(self.allowance)
             self._shown = self.counts()
             self._share_out(self.left())
@@ -532,6 +554,51 @@ class ContactProblem(ContactCandidates, GapProblem):
         """Pairs of which windows expect that friction is not known better than LAW."""
         return []
 
+    def unseen(
+        self, recordings: Sequence[Recording], start: Fitted, end: Fitted
+    ) -> tuple[tuple[float, float], dict[str, InUnits]] | None:
+        """What two fits, with their effects and nuisances, leave of the equations of
+        motion in recordings that nothing was decided on: rms over the noise, and of
+        each equation in its unit. None where too little moves, or touches, there."""
+        try:
+            other = type(self)(self.scene, earlier(recordings, self.late), self)
+        except DoesNotFit:
+            return None
+        its = other.nuisances()
+        left = []
+        for fitted in (start, end):
+            by_name = dict(zip(self.nuisances().names, fitted.b, strict=True))
+            b = np.array([by_name.get(name, 0.0) for name in its.names])
+            try:
+                left.append(other.residual(fitted.effects) - its.columns @ b)
+            except ValueError:  # There a tool was where a wall would be.
+                return None
+        before, after = left
+        units = other.in_units_of_equations(before, after)
+        return (rms(before), rms(after)), units
+
+    def in_units_of_equations(
+        self, before: np.ndarray, after: np.ndarray
+    ) -> dict[str, InUnits]:
+        """{name: errors} of each equation, of what two models leave of rows (m,)."""
+        n, noise = len(self.allowance), self.sensor_std()
+        newtons = []
+        for left in (before, after):
+            r = np.zeros(self._shown.shape)
+            r[self._shown] = left
+            newtons.append(self.in_newtons(r[:, :n]))
+        slides = sliding_joints(self.plant)
+        found = {}
+        for k, name in enumerate(self.coordinates):
+            body, _, axis = name.rpartition(".")
+            turns = axis[0] == "r" if body in self.bodies else name not in slides
+            rows = self._shown[:, k]
+            found[f"{name} equation"] = InUnits(
+                "N m" if turns else "N", rms(newtons[0][rows, k]),
+                rms(newtons[1][rows, k]), float(noise[k]),
+            )  # fmt: skip
+        return found
+
     def outcome(
         self, effects, start: Fitted, end: Fitted, nuisances: Nuisances,
         recordings=None, jobs: int = 1,
@@ -564,8 +631,11 @@ class ContactProblem(ContactCandidates, GapProblem):
             model = model.with_spread_of(effects)
         before = model.simulate(())
         after = model.simulate(effects) if effects else before
+        gap = gap_measure(model, before, after, held)
+        if recordings is not None and (found := self.unseen(recordings, start, end)):
+            gap = replace(gap, in_equations=found[0], equations=found[1])
         return Outcome(
-            gap_measure(model, before, after, held),
+            gap,
             series_of(model, before, after, held),
             unexplained_in_windows(model, after),
         )

@@ -142,14 +142,19 @@ class PressingProblem(FeltPlaces):
         ContactProblem.plan, by_channel=True, most_effects=MOST_EFFECTS, loud=LOUD
     )
 
-    def __init__(self, scene: Scene, recordings: Sequence[Recording]):
+    def __init__(
+        self,
+        scene: Scene,
+        recordings: Sequence[Recording],
+        learned: ContactProblem | None = None,
+    ):
         self._any_friction = False
         self._mu: float | None = None
         # How often rows were weighed; what last pressed, and for which effects.
         self._weighed = 0
         self._pressed_at: tuple[tuple | None, dict] = (None, {})
         self._not_passed: tuple = ()  # Places with which the tool went through nothing.
-        super().__init__(scene, recordings)
+        super().__init__(scene, recordings, learned)
 
     # ----- Rows
 
