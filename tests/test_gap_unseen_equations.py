@@ -148,3 +148,11 @@ def test_the_share_closed_in_equations_counts_from_the_floor():
     assert gap.reduction_in_equations == pytest.approx(0.5)
     assert gap.reduction == 0.0
     assert np.isnan(replace(gap, in_equations=None).reduction_in_equations)
+
+
+def test_effects_that_these_recordings_refuse_tell_nothing(pushes):
+    problem, start, end, _, unseen = pushes
+    refused = Effect("friction_patch", [PAIR], dict(
+        friction=0.4, x_min=0.1, x_max=0.0, y_min=0.0, y_max=0.1
+    ))  # fmt: skip
+    assert problem.unseen(unseen, start, replace(end, effects=(refused,))) is None
