@@ -213,6 +213,9 @@ class GapProblem(ABC):
     recordings: list[Recording]
     dynamics: SceneDynamics
     plan: SearchPlan
+    # Whether rows are equations of motion; else they are samples of simulated windows,
+    # or distances.
+    by_equations: bool = True
     # Root of how many neighbouring rows say the same: their errors go together.
     correlation: float = 1.0
 

@@ -103,33 +103,42 @@ def shows_in_equations_alone(gap: GapMeasure) -> bool:
     return gap.window_s > 0.0 and gap.after <= AGREEMENT_RMS_MAX
 
 
-def two_figures(start: float, end: float, gap: GapMeasure) -> str:
+def two_figures(
+    start: float, end: float, gap: GapMeasure, by_equations: bool = True
+) -> str:
     """A sentence where equations, whose error goes from start to end, and simulated
     windows disagree on what is left by more than a factor of two, or only equations
-    show the gap (a heavier object goes where it is pushed all the same); else
-    nothing."""
+    show the gap (a heavier object goes where it is pushed all the same); else nothing.
+    by_equations: False where these errors are of simulated windows, too: of the data
+    that effects were selected on."""
     if not start > AGREEMENT_RMS_MAX or not gap.window_s > 0.0:
         return ""
     if gap.before <= AGREEMENT_RMS_MAX:
-        of = ""
-        if gap.in_equations and gap.in_equations[0] > AGREEMENT_RMS_MAX:
-            of = " of data held out for the report"
+        where = "Simulated windows do not show this gap; in the equations of motion"
+        if not by_equations:
+            where = (
+                "The data held out for the report do not show this gap; in the data "
+                "that effects were selected on"
+            )
+        elif gap.in_equations and gap.in_equations[0] > AGREEMENT_RMS_MAX:
+            where += " of data held out for the report"
             start, end = gap.in_equations
-        return (
-            f" Simulated windows do not show this gap; in the equations of motion{of} "
-            + (f"the error falls from {figure(start)} to {figure(end)} times the noise."
-               if end < start else f"the error is {figure(start)} times the noise.")
-        )  # fmt: skip
-
-    equations, simulated = (
-        share_left(*each) for each in ((start, end), (gap.before, gap.after))
-    )
+        goes = f"is {figure(start)}"
+        if end < start:
+            goes = f"falls from {figure(start)} to {figure(end)}"
+        return f" {where} the error {goes} times the noise."
+    one, other = (share_left(*each) for each in ((start, end), (gap.before, gap.after)))
     # Of next to nothing, half and twice are the same.
-    if 0.5 <= max(equations, 0.1) / max(simulated, 0.1) <= 2.0:
+    if 0.5 <= max(one, 0.1) / max(other, 0.1) <= 2.0:
         return ""
+    if not by_equations:
+        return (
+            f" Of the gap {min(one, 1.0):.0%} is left in the data that effects were "
+            f"selected on, {other:.0%} in the data held out for the report."
+        )
     return (
-        f" The equations of motion say that {min(equations, 1.0):.0%} of the gap is "
-        f"left, simulation {simulated:.0%}: trust the simulation, because it is how "
+        f" The equations of motion say that {min(one, 1.0):.0%} of the gap is "
+        f"left, simulation {other:.0%}: trust the simulation, because it is how "
         "the repaired model will be used."
     )
 
@@ -187,9 +196,10 @@ def says(
     gap: GapMeasure,
     more: str = "",
     left: float = 0.0,
+    by_equations: bool = True,
 ) -> str:
     """The first screen's sentence. more: what is to be added to it; left: the error in
-    the equations of motion, with all effects."""
+    the equations of motion, with all effects; by_equations: as of two_figures."""
     before, after = figure(gap.before), figure(gap.after)
     if verdict == "no_gap":
         return (
@@ -209,8 +219,11 @@ def says(
         head = f"{words} Beyond that, " if words else ""
         error = f"{after} times the noise"
         if shows_in_equations_alone(gap) and left > gap.after:
-            error = f"{figure(left)} times the noise in the equations of motion, "
-            error += f"{after} in simulated windows"
+            places = "the equations of motion", "simulated windows"
+            if not by_equations:
+                places = "the data for selection", "those for the report"
+            error = f"{figure(left)} times the noise in {places[0]}, "
+            error += f"{after} in {places[1]}"
         if words and gap.before > AGREEMENT_RMS_MAX:
             error += f" ({before} without what is named)"
         return head + (

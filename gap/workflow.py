@@ -346,7 +346,7 @@ def conclude(
         near += unjudged
     left = problem.error(selection.end)
     if verdict != "gap_unnamed" or not shows_in_equations_alone(final.gap):
-        near += two_figures(start, left, final.gap)
+        near += two_figures(start, left, final.gap, problem.by_equations)
     if turned and verdict in ("gap_named", "ambiguous"):
         verdict = "ambiguous"
         near += turned
@@ -368,7 +368,8 @@ def conclude(
     fixed = [c.fixed for c in selection.choices]
     prior = nuisances.prior
     return GapResult(
-        verdict, says(verdict, effects, final.gap, near, left),
+        verdict,
+        says(verdict, effects, final.gap, near, left, problem.by_equations),
         problem.where(selection.start.left) if verdict not in AGREES else [], effects,
         final.gap, final.unexplained if verdict == "gap_unnamed" else [],
         {n: float(b / p) for n, b, p in

@@ -2,6 +2,16 @@
 
 import pytest
 
+from makebreak.gap.residuals.contact_problem import ContactProblem
+from makebreak.gap.residuals.driven import DrivenProblem
+from makebreak.gap.residuals.impacts import ImpactProblem
+from makebreak.gap.residuals.mechanism import MechanismProblem
+from makebreak.gap.residuals.objects import (
+    FlightProblem,
+    RolloutProblem,
+    TouchProblem,
+)
+from makebreak.gap.residuals.pressing import PressingProblem
 from makebreak.gap.result import GapMeasure, NamedEffect
 from makebreak.gap.verdict import says, two_figures
 
@@ -71,3 +81,21 @@ def test_what_is_left_beside_what_is_named_has_both_figures():
     assert "It carries 2 kg. Beyond that, a gap remains" in said
     assert "1.6 times the noise in the equations of motion, 0.28 in simulated" in said
     assert said.endswith("(30.8 without what is named).")
+
+
+def test_where_all_errors_are_of_windows_the_sentence_speaks_of_their_data():
+    said = two_figures(11.0, 0.934, measure(1.41, 0.83), by_equations=False)
+    assert "equations" not in said
+    assert "held out for the report do not show this gap" in said
+    assert "selected on the error falls from 11 to 0.934 times the noise." in said
+    said = two_figures(41.0, 9.0, measure(41.0, 25.0), by_equations=False)
+    assert "20% is left in the data that effects were selected on, 60% in" in said
+    text = says("gap_unnamed", [], measure(1.1, 1.0), "", 70.0, by_equations=False)
+    assert "70 times the noise in the data for selection, 1 in those for the" in text
+
+
+def test_which_problems_are_of_equations():
+    windows = {ImpactProblem, FlightProblem, RolloutProblem, DrivenProblem}
+    equations = {ContactProblem, PressingProblem, MechanismProblem}
+    assert not any(each.by_equations for each in windows | {TouchProblem})
+    assert all(each.by_equations for each in equations)

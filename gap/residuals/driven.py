@@ -98,6 +98,7 @@ class DrivenWindows(WindowModel):
 class DrivenProblem(DrivenWindows, GapProblem):
     """Windows of joints that follow commands, as a problem for the search."""
 
+    by_equations = False
     plan = SearchPlan(  # fmt: skip
         evaluations=4,
         diff_step=1e-2,

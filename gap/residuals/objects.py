@@ -40,6 +40,7 @@ COMPARED = ("position", "x", "y", "z", "qw", "qx", "qy", "qz", "fx", "fy", "fz")
 class TouchProblem(TouchModel, GapProblem):
     """A measured mechanism, and a wrench that tells when it touches an object."""
 
+    by_equations = False
     # Two explanations that both leave less than the allowance for shapes are a tie.
     plan = SearchPlan(least_error=1.0)
 
@@ -85,6 +86,8 @@ class TouchProblem(TouchModel, GapProblem):
 
 class WindowedProblem(GapProblem):
     """What problems of simulated windows share."""
+
+    by_equations = False
 
     def nuisances(self) -> Nuisances:
         return contact_nuisances(self._model())
