@@ -40,6 +40,7 @@ from makebreak.gap.problem import (
     Outcome,
     share_left,
 )
+from makebreak.gap.residuals.command_times import set_command_times
 from makebreak.gap.residuals.driven import DrivenProblem, is_driven, sticks
 from makebreak.gap.residuals.impacts import ImpactProblem, runs_against, without_contact
 from makebreak.gap.residuals.late_poses import contact_problem
@@ -209,7 +210,8 @@ def problem_for(
                 pass
         if runs_against(dynamics, recordings):
             try:
-                return ImpactProblem(scene, recordings), []
+                impacts = ImpactProblem(scene, recordings)
+                return impacts, set_command_times(impacts)
             except DoesNotFit:  # Too few touches to tell.
                 pass
         if is_driven(scene, recordings):

@@ -7,6 +7,7 @@ import pytest
 from gap_benchmark import cart_world
 from gap_benchmark.cart_world import PAIR
 
+from makebreak.gap.data.findings import SAMPLED_COMMANDS
 from makebreak.gap.data.pieces import part_of
 from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.data.recording import Episode
@@ -20,6 +21,7 @@ from makebreak.gap.residuals.fixed_faces import PASSED
 from makebreak.gap.residuals.impacts import (
     FREE_SEC,
     MOST_FREE,
+    TIMING,
     ImpactProblem,
     ImpactWindows,
     positions,
@@ -132,6 +134,36 @@ def test_velocities_that_come_late_are_no_softer_wall(tmp_path):
     for effect, value, std in each:
         ((key, found),) = effect.parameters.items()
         assert abs(found - value) < 2.0 * std[key]
+
+
+@pytest.mark.parametrize(
+    ("rows", "shift"), [(2, 0), (4, 0), (2, 2), (1, 0), (2, 5)]
+)  # fmt: skip
+def test_commands_of_a_faster_loop_act_where_free_motion_says(tmp_path, rows, shift):
+    """Every `rows`-th row of a loop is logged, its commands as of `shift` rows before:
+    on the mean they act so much earlier, or later, than if held from row to row. More
+    than a row is no timing of rows, and is left to the search."""
+    cart = cart_world.Cart()
+    rng = np.random.default_rng(3)
+    table, noise = cart_world.record(cart, rng, 8.0, 250.0, wave=2.0)
+    name = "cart.rail.effort_command"
+    commands = np.roll(table[name], -shift)  # Logged before they act.
+    table = {c: x[: len(x) - 8 : rows] for c, x in (table | {name: commands}).items()}
+    scene = read_scene(cart_world.write(tmp_path, cart, table, noise))
+    recordings = read_recordings([tmp_path / "recording.csv"])
+    problem, found = problem_for(scene, recordings, SceneDynamics(scene))
+    assert isinstance(problem, ImpactProblem)
+    expected = (shift - 0.5 * (rows - 1)) / rows  # Of the log's rows.
+    if rows == 1 or abs(expected) > 1.0:
+        assert problem.commands_late == 0.0 and not found
+        return
+    late = problem.commands_late * 250.0 / rows
+    assert late == pytest.approx(expected, abs=0.04)
+    assert [each.kind for each in found] == [SAMPLED_COMMANDS]
+    # So are those of what is reported on.
+    assert problem._again(recordings).commands_late == problem.commands_late
+    assert np.sqrt(np.mean(problem.residual(()) ** 2)) < 1.1
+    assert TIMING in problem.nuisances().names
 
 
 def test_free_motion_is_judged_between_walls_that_are_near(tmp_path):

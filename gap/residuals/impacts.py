@@ -47,6 +47,8 @@ TRIED = (0.2, 0.4, 0.7, 0.9, 1.15, 1.7, 2.6, 4.5)  # Times what the scene has.
 DAMPED = (0.02, 0.06, 0.12, 0.25, 0.5, 1.0)  # Of critical damping: a linear damper's.
 SMALL = 0.2  # First trial of an effect on joints, of the efforts there.
 REACH = 3.0
+LATE_SHARE = 0.1  # Of a row, by which commands are moved to see what that does.
+TIMING = "timing of the commands"  # A nuisance.
 LATE_SEC = 2.5e-4  # A velocity may come so much later than its position.
 
 
@@ -200,7 +202,8 @@ class ImpactWindows(WindowModel):
     """Windows about touches, and of free motion.
 
     Args: shapes: those that touch, if that was decided on other recordings; then one
-        touch is enough.
+        touch is enough. commands_late: by how much later than their rows commands act
+        [s].
     Raises: DoesNotFit where there are fewer than FEWEST touches.
     """
 
@@ -209,7 +212,9 @@ class ImpactWindows(WindowModel):
         scene: Scene,
         recordings: Sequence[Recording],
         shapes: ContactShapes | None = None,
+        commands_late: float = 0.0,
     ):
+        self.commands_late = commands_late
         scene, fewest = with_step(scene, 0.0), FEWEST if shapes is None else 1
         self.shapes = shapes or _met_walls(SceneDynamics(scene), recordings)
         if self.shapes is None:
@@ -220,15 +225,19 @@ class ImpactWindows(WindowModel):
         super().__init__(scene, recordings, LONGEST_SEC, most=10**6)
         if self._touches < fewest:
             raise DoesNotFit(f"{self._touches} touches, expected {fewest} or more")
-        both = []
+        both: list[Window] = []
+        self.is_free: list[bool] = []  # Of each window.
         touching = [w for w in self.windows if w not in self._free]
-        for some, most in ((touching, MOST_TOUCHES), (self._longest(), MOST_FREE)):
+        for some, most, is_free in (
+            (touching, MOST_TOUCHES, False), (self._longest(), MOST_FREE, True),
+        ):  # fmt: skip
             keep = np.unique(np.linspace(0, len(some) - 1, most).astype(int))
             # Every third is held out, of each sort.
             both += [
                 replace(some[k], train=i % 3 != 1)
                 for i, k in enumerate(keep if some else [])
             ]
+            self.is_free += [is_free] * (len(both) - len(self.is_free))
         self.windows = both
         self.window_sec = float(np.median([
             np.ptp(self.recordings[w.recording].time[w.rows]) for w in both
@@ -347,7 +356,7 @@ class ImpactProblem(ImpactWindows, WindowedProblem):
         return self
 
     def _again(self, recordings: Sequence[Recording]) -> WindowModel:
-        return ImpactWindows(self.scene, recordings, self.shapes)
+        return ImpactWindows(self.scene, recordings, self.shapes, self.commands_late)
 
     def nuisances(self) -> Nuisances:
         """The links' masses and centres, contact stiffness and dissipation as far as
@@ -376,10 +385,46 @@ class ImpactProblem(ImpactWindows, WindowedProblem):
                 columns.append(self._late(channel))
                 prior.append(LATE_SEC)
                 names.append(f"timing of {channel}")
+        if self.has_commands():
+            columns.append(self.of_late_commands())
+            prior.append(self.row_sec() / REACH)
+            names.append(TIMING)
         self._names = tuple(names)
         if not columns:
             return Nuisances.none(len(self.base()))
         return Nuisances(np.stack(columns, 1), np.array(prior), self._names, REACH)
+
+    def has_commands(self) -> bool:
+        return any(self._commanded(recording) for recording in self.recordings)
+
+    def row_sec(self) -> float:
+        return min(recording.period_sec() for recording in self.recordings)
+
+    def of_late_commands(self) -> np.ndarray:
+        """(m,) what each second by which commands act later adds to the residual."""
+        now, base, step = self.commands_late, self.base(), LATE_SHARE * self.row_sec()
+        try:
+            self.set_commands_late(now + step)
+            return (base - self.residual()) / step
+        finally:
+            self.set_commands_late(now)
+            self._base = base
+
+    def of_joints(self) -> np.ndarray:
+        """(m, k) what each kind with one parameter does at each joint, in its first
+        step; but those that make commands late."""
+        columns = []
+        for kind, at, name, trials in self._of_joints():
+            moved = None
+            if KINDS[kind].path not in ("delay", "lag"):
+                moved = self._try((), Effect(kind, [at], {name: trials[0][1]}))
+            if moved is not None and np.abs(self.base() - moved).max() > 1e-3:
+                columns.append(self.base() - moved)
+        return np.stack(columns, 1) if columns else np.zeros((len(self.base()), 0))
+
+    def free_rows(self) -> np.ndarray:
+        """(m,) whether each row is of free motion."""
+        return self._by_row(self.is_free)
 
     def _late(self, channel: str) -> np.ndarray:
         """(m,) what each second by which a channel is late adds to the residual: its

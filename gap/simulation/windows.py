@@ -134,6 +134,8 @@ class WindowModel(WindowedResidual):
         together for longer than a window}, beside that of a sample.
     """
 
+    commands_late = 0.0
+
     def __init__(
         self,
         scene: Scene,
@@ -206,6 +208,11 @@ class WindowModel(WindowedResidual):
             )
         self._commands: dict[tuple[float, ...], list[dict[int, Commands]]] = {}
         self.runs = 0
+
+    def set_commands_late(self, seconds: float) -> None:
+        """By how much later than their rows commands act from now on [s]."""
+        self.commands_late = seconds
+        self._commands, self._base = {}, None
 
     # ----- Cutting
 
@@ -330,6 +337,8 @@ class WindowModel(WindowedResidual):
                 columns = {n: recording.held(n)[episode.rows] for n in names}
                 if not names:  # What the motors gave stands in for it.
                     time, columns = self._given(recording, episode, i, late)
+                else:
+                    time = time + self.commands_late
                 of[episode.first] = Commands(time, columns)
             out.append(of)
         self._commands[key] = out

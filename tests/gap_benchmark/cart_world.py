@@ -66,9 +66,9 @@ def _run(x, v, times, u, step, m, gap, k, d, c, coulomb, damping):
     return out
 
 
-def record(cart: Cart, rng, seconds=16.0, rate=500.0, encoder=1e-5):
+def record(cart: Cart, rng, seconds=16.0, rate=500.0, encoder=1e-5, wave=0.0):
     """A table {column: (n,)} and noise: the cart is driven to and fro, against both
-    walls at several speeds."""
+    walls at several speeds, and by a wave of 5 Hz [N] besides."""
     t = np.arange(int(seconds * rate)) / rate
     u, x, v = np.zeros(len(t)), 0.0, 0.0
     out = np.empty((len(t), 2))
@@ -80,7 +80,7 @@ def record(cart: Cart, rng, seconds=16.0, rate=500.0, encoder=1e-5):
         # A simple controller: push to one side until a while after the wall was met.
         if side * x > gap - 0.01 and side * v < -0.02:
             side, push = -side, rng.uniform(1.5, 4.0)
-        u[i] = side * push - 2.0 * v
+        u[i] = side * push - 2.0 * v + wave * np.sin(10.0 * np.pi * t[i])
         if i + 1 < len(t):
             row = _run(
                 x, v, t[i : i + 2], u[i : i + 2], STEP, cart.mass, gap, cart.stiffness,
