@@ -62,7 +62,10 @@ def contact_nuisances(model: FreeBodyModel | WindowModel) -> Nuisances:
         if share <= 0.0:
             continue
         for at in model.dynamics.places(kind):
-            ((name, now),) = model.dynamics.now(kind, [at]).items()
+            try:
+                ((name, now),) = model.dynamics.now(kind, [at]).items()
+            except ValueError:  # Its shapes are not alike.
+                continue
             step = min(0.3 * share, 0.2)
             r = _residual(model, Effect(kind, [at], {name: now * (1.0 + step)}))
             if r is None or not np.abs(model.base() - r).max() > 1e-6:

@@ -366,7 +366,10 @@ class ImpactProblem(ImpactWindows, WindowedProblem):
         for kind in CONTACT_LAW:
             share = float(self.scene.tolerance.get(kind, 0.0))
             for at in self._pairs() if share > 0.0 else ():
-                ((name, now),) = self.dynamics.now(kind, [at]).items()
+                try:
+                    ((name, now),) = self.dynamics.now(kind, [at]).items()
+                except ValueError:  # Its shapes are not alike.
+                    continue
                 step = min(0.3 * share, 0.2) * now
                 changes.append(
                     (f"{kind} of {at}", Effect(kind, [at], {name: now + step}), step)

@@ -22,6 +22,7 @@ from makebreak.gap.simulation.stand_on_ground import stand_on_ground
 from makebreak.gap.simulation.windows import LARGEST
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
+from makebreak.models.effects.contact_surface import stiffness_of
 from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
 from makebreak.models.scene import Scene, load_scene
 from makebreak.systems.numerics.filters import mean_delay
@@ -31,6 +32,7 @@ SHAPES = 2e-4  # How well shapes are known where the scene does not say [m].
 PLACED, SCALED = 1e-3, 0.005
 CLEAR = 6.0  # A force is one beyond so many times its noise,
 LEAST_FORCE = 0.5  # and beyond this [N].
+COMPLIANCE = 1e-6  # Of shapes that say nothing of it, in all [m/N].
 NEAR = 0.03  # Farther apart than this the tool touches something else [m].
 BLOCK_SEC, MOST = 1.2, 300
 _FORCE = ("fx", "fy", "fz")
@@ -242,20 +244,25 @@ class TouchModel:
         lies = f"{touch.thing}.z" not in recording
         mine = plant.GetCollisionGeometriesForBody(thing)
         theirs = plant.GetCollisionGeometriesForBody(tool)
-        out = np.empty(len(q))
+        inspector = scene_graph.model_inspector()
+        soft = {
+            shape: 1.0 / stiffness_of(inspector.GetProximityProperties(shape))
+            for shape in (*mine, *theirs)
+        }
+        out, compliance = np.empty(len(q)), np.empty(len(q))
         for n, row in enumerate(q):
             plant.SetPositions(context, row)
             if lies:
                 stand_on_ground(plant, context, scene_graph, query_context, thing)
             query = port.Eval(query_context)
-            out[n] = min(
-                query.ComputeSignedDistancePairClosestPoints(a, b).distance
+            # Of a body whose shapes are not equally stiff, the one that is met counts.
+            out[n], compliance[n] = min(
+                (query.ComputeSignedDistancePairClosestPoints(a, b).distance,
+                 soft[a] + soft[b] or COMPLIANCE)
                 for a in theirs
                 for b in mine
-            )
-        pair = Effect("contact_stiffness", [f"{touch.thing}~{touch.tool}"], {})
-        stiffness = self.dynamics.now(pair.kind, pair.at)["stiffness"]
-        return out + touch.force / stiffness
+            )  # fmt: skip
+        return out + touch.force * compliance
 
     # ----- As InverseModel
 
