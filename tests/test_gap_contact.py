@@ -1,5 +1,6 @@
 """The gap workflow on objects: closed forms, measured tosses, development cases."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -7,8 +8,11 @@ import pytest
 from ball_table import write_ball_table
 from gap_benchmark.cases import cases, make, write
 
+from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.residuals.contact import CELLS, _patch_search
+from makebreak.gap.residuals.touch import TouchModel
 from makebreak.gap.workflow import run_gap
+from makebreak.models.scene import read_scene
 
 G, RADIUS, NOISE = 9.81, 0.04, 5e-5
 
@@ -202,6 +206,25 @@ def test_a_ball_that_is_touched_is_measured_by_it(tmp_path):
     assert effect.parameters["radius"].value == pytest.approx(true, abs=5e-5)
     assert result.gap.after < 0.2 * result.gap.before
     assert result.where
+
+
+def test_of_shapes_that_are_not_equally_stiff_the_one_that_is_met_counts(tmp_path):
+    """A core ten times as soft, inside the ball, is never met."""
+    scene, file = touched(tmp_path, RADIUS, RADIUS)
+    ball = tmp_path / "ball.sdf"
+    before, shape, after = re.split(
+        "(<collision.*?</collision>)", ball.read_text(), flags=re.DOTALL
+    )
+    core = re.sub("name='[^']*'|name=\"[^\"]*\"", "name='core'", shape, count=1)
+    core = core.replace(f"<radius>{RADIUS}", "<radius>0.01")
+    soft = re.sub("(contact_stiffness>)[^<]*", r"\g<1>20000", core)
+    assert soft != core != shape
+    ball.write_text(before + shape + soft + after)
+    model = TouchModel(read_scene(scene), read_recordings([file]))
+    (touch,) = model.touches
+    # Up to 8 N on 1e5 N/m are 80 um, on the soft core 440 um.
+    assert np.abs(np.mean(model._distances(touch, ()))) < 1e-5
+    assert np.abs(np.polyfit(touch.force, model._distances(touch, ()), 1)[0]) < 2e-5
 
 
 def test_a_patch_is_found_across_steps_and_valleys_of_the_error():

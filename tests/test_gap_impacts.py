@@ -106,6 +106,26 @@ def test_a_linear_damper_is_no_dissipation(tmp_path):
     assert fitted.b[own.index(True)] == 0.0
 
 
+def test_shapes_that_are_not_alike_have_no_stiffness_to_be_unsure_of(
+    tmp_path, monkeypatch
+):
+    scene_file, file, _ = ran(tmp_path, 2, 5.0)
+    scene, recordings = read_scene(scene_file), read_recordings([file])
+    scene.tolerance["contact_dissipation"] = 1.0
+    problem, _ = problem_for(scene, recordings, SceneDynamics(scene))
+
+    now = problem.dynamics.now
+
+    def differs(kind, at):
+        if kind.startswith("contact_"):
+            raise ValueError(f"{kind}: surfaces of different stiffness")
+        return now(kind, at)
+
+    assert any(name.startswith("contact_") for name in problem.nuisances().names)
+    monkeypatch.setattr(problem.dynamics, "now", differs)
+    assert not any(name.startswith("contact_") for name in problem.nuisances().names)
+
+
 def test_velocities_that_come_late_are_no_softer_wall(tmp_path):
     """0.1 ms, a twentieth of a row, take a stiff wall's stiffness along unless the
     velocities may be late."""
