@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from makebreak.gap.at_impacts import impacts_differ
 from makebreak.gap.by_recording import (
     Alone,
     Together,
@@ -159,6 +160,21 @@ def run_gap(
     reported = excerpt(reported, REPORTED_SEC, REPORTED_ROWS) if reported else []
     result = conclude(problem, selection, reported, checks, jobs)
     seconds["simulate"] = clock.lap()
+    unnamed = result.verdict == "gap_unnamed" and not (
+        result.effects and result.gap.reduction >= CLOSED_SHARE_MIN
+    )
+    if isinstance(problem, FlightProblem) and unnamed:
+        between = problem.between_impacts()
+        if between is not None:
+            say("searching between impacts")
+            apart = conclude(between, select(between, say), reported, checks, jobs)
+            named_there = [each.effect() for each in apart.effects]
+            start = selection.start
+            whole = problem.outcome(
+                named_there, start, start, selection.nuisances, reported or None, jobs
+            )
+            result = impacts_differ(problem, apart, whole) or result
+        seconds["impacts"] = clock.lap()
     if isinstance(problem, MechanismProblem) and may_differ(
         problem, selection.end, result
     ):

@@ -77,6 +77,7 @@ class FreeWindow:
     block: int
     train: bool  # Every third block is held out.
     after_hits: int  # Impacts of the episode before it.
+    hit: int  # Its row at which the impact that ends it is; if none does, their number.
     # Of each body whose orientation is not measured, as it rolls or slides.
     rolling: tuple[Rolling | None, ...] = ()
 
@@ -84,6 +85,7 @@ class FreeWindow:
 class FreeBodyModel(WindowedResidual):
     """Residuals of windows of free bodies, as InverseModel gives those of mechanisms.
 
+    Args: after_sec: that a window goes on after its impact; 0: it ends before it.
     Raises: DoesNotFit where scene or recordings hold anything else (FreeBodiesScene),
         or bodies with faces come near one another; the bodies' x, y and z must be
         measured.
@@ -138,7 +140,7 @@ class FreeBodyModel(WindowedResidual):
             {c: stages for c in self.channels if (stages := r.channels[c].stages)}
             for r in recordings
         ]
-        self._after = after_sec
+        self.after_sec = after_sec
         # Of each flight, and how much a curvature of its path that gravity does not
         # make takes off its squared residuals.
         self._curvatures: list[float] = []
@@ -329,16 +331,17 @@ class FreeBodyModel(WindowedResidual):
         spans = []
         if before_hit:
             first = b + int(np.argmax(rough[b:]))
-            end = int(np.searchsorted(time, time[first] + self._after, "right"))
-            spans.append((a, b, time[first], min(end, len(time))))
+            end = int(np.searchsorted(time, time[first] + self.after_sec, "right"))
+            end = min(end, len(time)) if self.after_sec > 0.0 else b
+            spans.append((a, b, time[first], end, first))
         if time[b - 1] - time[a] >= LEAST_SEC:
             starts = np.arange(time[a], time[b - 1] - LEAST_SEC, LONG_SEC)
             for t in starts:
                 k = int(np.searchsorted(time, t))
                 end = min(int(np.searchsorted(time, t + LONG_SEC, "right")), b)
                 late = min(int(np.searchsorted(time, t + 0.15)), end)
-                spans.append((k, max(late, k + 1), time[end - 1], end))
-        for k0, k1, aim, end in spans:
+                spans.append((k, max(late, k + 1), time[end - 1], end, end))
+        for k0, k1, aim, end, struck in spans:
             tau = aim - time[k0:k1]
             P = spreads[k0 - a : k1 - a, np.arange(7 * many) % 7 >= 4]
             wide = np.sum(
@@ -361,7 +364,7 @@ class FreeBodyModel(WindowedResidual):
                     i, episode.number, float(time[k]),
                     slice(episode.first + k, episode.first + end), states[k - a],
                     spreads[k - a], np.zeros(0), block, block % 3 != 1, before,
-                    tuple(each[k - a] for each in rolls),
+                    min(struck, end) - k, tuple(each[k - a] for each in rolls),
                 )
             )  # fmt: skip
 
