@@ -62,6 +62,6 @@ def _at_impacts(problem: FlightProblem, effects: Sequence[Effect]) -> str:
         f"In the {problem.after_sec:g} s after {len(off)} of {struck} impacts the "
         f"simulation is off, most in {channel}: {figure(size, 2)} times its noise in "
         f"episode {episode}, after {at:.3g} s. No stiffness, dissipation or linear "
-        "damper of the contact explains it, nor any other effect: the law of contact is another, "
-        "and nothing was concluded from what follows an impact."
+        "damper of the contact explains it, nor any other effect: the law of contact "
+        "is another, and nothing was concluded from what follows an impact."
     )
