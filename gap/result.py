@@ -64,11 +64,21 @@ class Evidence:
 
 
 @dataclass(frozen=True)
+class RivalSet:
+    """Effects that explain the data as well in the place of an effect and of those that
+    are named beside it: `instead` of it and of `beside`."""
+
+    beside: tuple[Effect, ...]
+    instead: tuple[Effect, ...]
+
+
+@dataclass(frozen=True)
 class NamedEffect:
     """An effect that the model lacks.
 
     indistinguishable_from: others that explain these data as well, with the parameters
-    that they would have. identifiable: "identifiable", "weak" or "not". recordings: in
+    that they would have. sets: the same of this effect and another one together.
+    identifiable: "identifiable", "weak" or "not". recordings: in
     which it is, where it is not in all of them.
     """
 
@@ -81,6 +91,7 @@ class NamedEffect:
     tell_apart: str = ""
     identifiable: str = "identifiable"
     recordings: tuple[str, ...] = ()
+    sets: tuple[RivalSet, ...] = ()
 
     def effect(self) -> Effect:
         """As a scene file lists it."""
@@ -352,15 +363,23 @@ def _effect_json(each: NamedEffect) -> dict[str, Any]:
             "margin": _number(each.evidence.margin),
         },
         "identifiable": each.identifiable,
-        "indistinguishable_from": [
+        "indistinguishable_from": [_of(e) for e in each.indistinguishable_from],
+        "indistinguishable_together": [
             {
-                "kind": other.kind,
-                "at": other.at[0] if len(other.at) == 1 else list(other.at),
-                "parameters": {k: _number(v) for k, v in other.parameters.items()},
+                "with": [{k: _of(e)[k] for k in ("kind", "at")} for e in s.beside],
+                "from": [_of(e) for e in s.instead],
             }
-            for other in each.indistinguishable_from
+            for s in each.sets
         ],
         "tell_apart": each.tell_apart,
+    }
+
+
+def _of(effect: Effect) -> dict[str, Any]:
+    return {
+        "kind": effect.kind,
+        "at": effect.at[0] if len(effect.at) == 1 else list(effect.at),
+        "parameters": {k: _number(v) for k, v in effect.parameters.items()},
     }
 
 

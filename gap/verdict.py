@@ -42,7 +42,7 @@ def verdict_of(
         return "no_gap" if calm else "gap_unnamed"
     if far or leaves_gap(start, end):
         return "gap_unnamed"
-    return "ambiguous" if any(c.ties for c in choices) else "gap_named"
+    return "ambiguous" if any(c.ties or c.sets for c in choices) else "gap_named"
 
 
 def after_simulation(
@@ -172,7 +172,8 @@ def named(choice: Choice, plant: MultibodyPlant, beside: str = "") -> NamedEffec
         if spread > 0.0:
             std[each.name] = spread
     apart = ""
-    if choice.ties or kind.tell_apart:
+    tied = bool(choice.ties or choice.sets)
+    if tied or kind.tell_apart:
         apart = kind.tell_apart[:1].upper() + kind.tell_apart[1:] + "."
     says = sentence(choice.effect, kind, std, slides, choice.or_more, choice.fixed)
     says = says.replace(OF_CHANNEL, own_unit)
@@ -185,8 +186,9 @@ def named(choice: Choice, plant: MultibodyPlant, beside: str = "") -> NamedEffec
         says[:1].upper() + says[1:] + ".",
         Evidence(choice.before, choice.after, choice.runner_up, choice.margin),
         choice.ties,
-        apart if choice.ties else "",
+        apart if tied else "",
         "weak" if weak else "identifiable",
+        sets=choice.sets,
     )
 
 
@@ -254,4 +256,11 @@ def _apart_from(effects: Sequence[NamedEffect]) -> str:
         text += f" These data cannot distinguish it from {', '.join(kinds)}."
     if places:
         text += f" It could equally be at {' or '.join(places)}."
+    for each in effects:
+        for rival in each.sets:
+            two = [f"{each.kind} at {', '.join(each.at)}", *map(called, rival.beside)]
+            text += (
+                f" These data cannot distinguish {' together with '.join(two)} from "
+                f"{' together with '.join(map(called, rival.instead))}."
+            )
     return text

@@ -892,6 +892,9 @@ def test_two_rivals_that_are_both_needed_are_both_named():
     assert set(found) == {"object_mass", "contact_friction"}
     assert found["object_mass"][0] == pytest.approx(0.7, abs=0.05)
     assert found["contact_friction"][0] == pytest.approx(0.7, abs=0.05)
+    choices = select(TwoForces(mass=0.7, friction=0.7, speeds=0.2)).choices
+    rivals = [c.needed_beside for c in choices]
+    assert rivals == [((o.effect.kind, ("a",)),) for o in reversed(choices)]
 
 
 @pytest.mark.parametrize(("inner", "tried"), [(True, True), (False, False)])

@@ -14,6 +14,7 @@ from makebreak.gap.report.summary import (
     next_best,
     number,
     says_of,
+    sets_of,
     windows_of,
 )
 from makebreak.gap.result import GapResult, NamedEffect, Unexplained
@@ -112,11 +113,11 @@ def _effect(each: NamedEffect, result: GapResult, i: int) -> str:
 
 
 def _ties(each: NamedEffect) -> str:
-    if not each.indistinguishable_from:
+    if not each.indistinguishable_from and not each.sets:
         return ""
     others = "".join(
-        f"<li>{sentence_html(says_of(other))}</li>"
-        for other in each.indistinguishable_from
+        f"<li>{sentence_html(other)}</li>"
+        for other in [*map(says_of, each.indistinguishable_from), *sets_of(each)]
     )
     tell = f"<p><b>To distinguish them:</b> {sentence_html(each.tell_apart)}</p>"
     return (

@@ -46,6 +46,11 @@ WRENCHED = 0.05  # A wrench sampled amid a drive's ripple is off by as much.
 SHAPED = (*SURFACES, *CONTACT_LAW)
 # What changes a free body's inertial parameters.
 INERTIAL = ("object_mass", "object_com", "object_inertia", "object_size")
+# What changes the mass matrix of a robot.
+OF_ROBOTS = frozenset(
+    name for name, kind in KINDS.items()
+    if kind.is_inertia and kind.at in ("joint", "body") and name not in INERTIAL
+)  # fmt: skip
 
 
 class ContactDynamics(PermittedContacts):
@@ -213,14 +218,15 @@ class ContactDynamics(PermittedContacts):
             f = self._pressed.setdefault(pair, np.zeros(len(needs)))
             f += weights[:, column]
 
-    def _sensor_covariance(self, inertia, gain) -> np.ndarray:
+    def _sensor_covariance(self, inertia, gain, more=0.0) -> np.ndarray:
         """(K, rows, rows) of what sensors' noise makes of the rows, with the inertia in
-        each row and the effort of each drive (n_v,) times so much."""
+        each row and the effort of each drive (n_v,) times so much, and a mass matrix
+        that is by `more` (K, n_v, n_v) larger."""
         m = self.means
         n_v = m.acceleration.shape[1]
         n = n_v + m.wrench.shape[1]
         C = np.zeros((len(m.time), n, n))
-        M = inertia[:, None] * self._M
+        M = inertia[:, None] * self._M + more
         C[:, :n_v, :n_v] = M @ self._a_covariance @ M.transpose(0, 2, 1)
         i, j = np.arange(n_v), np.arange(n_v, n)
         C[:, i, i] += gain**2 * m.effort_var
@@ -233,7 +239,9 @@ class ContactDynamics(PermittedContacts):
         Noise of an acceleration errs by the inertia of that model, of an effort by the
         gain of its drive. With the scene's own inertia in its place, of two models that
         differ by a common factor (a mass times 1.5; a drive that gives 1/1.5 of what
-        it should) the one with the smaller forces would err less, and win.
+        it should) the one with the smaller forces would err less, and win. So it is
+        with a robot's links: of a cart that is heavier and a motor that gives less,
+        each explains what the other does.
         """
         n_v = len(self.coordinates)
         inertia, gain = np.ones(n_v), np.ones(n_v)
@@ -247,26 +255,47 @@ class ContactDynamics(PermittedContacts):
                     gain[joint.velocity_start()] = e.parameters["gain"]
         for body, own in bodies.items():
             if body not in self.bodies:
-                continue  # A link's mass is off by little.
+                continue  # A link as a nuisance: its mass is off by little.
             i_v = self.bodies[body][1]
             before, more = self._ten(body), self._more_inertia(body, own)
             inertia[i_v + 3 : i_v + 6] = 1.0 + more[0] / before[0]
             trace = slice(4, 7)  # Of the inertia: it has no axes.
             inertia[i_v : i_v + 3] = 1.0 + more[trace].sum() / before[trace].sum()
         held = self._held(effects)
-        key = (*inertia, *gain, held.tobytes() if held.any() else None)
+        links = [e for e in effects if e.kind in OF_ROBOTS]
+        of_links = tuple((e.kind, *e.at, *sorted(e.parameters.items())) for e in links)
+        key = (*inertia, *gain, held.tobytes() if held.any() else None, of_links)
         if key not in self._root_of:
-            C = self._sensor_covariance(inertia, gain)
+            more = self._more_mass(links)
+            C = self._sensor_covariance(inertia, gain, more)
             scale = np.append(inertia * np.abs(gain), np.ones(C.shape[1] - n_v))
+            for joint, (_, i) in self.joints.items():
+                if self.by[joint] == "passive":  # Its inertia takes all that acts.
+                    M = self._M[:, i, i].sum()
+                    scale[i] *= (M + more[:, i, i].sum()) / M
             k = np.arange(C.shape[1])
             off = self.allowance + 1e-9 + 1e-6 * self.acting
             C[:, k, k] += (scale * off) ** 2
             i = np.arange(n_v)
             C[:, i, i] += held**2 / 3.0  # Evenly in between.
-            kept = [(*(1.0,) * (2 * n_v), None)]  # The scene's own, and the last.
+            kept = [(*(1.0,) * (2 * n_v), None, ())]  # The scene's own, and the last.
             self._root_of = {k: r for k, r in self._root_of.items() if k in kept}
             self._root_of[key] = roots_of(C)
         return self._root_of[key]
+
+    def _more_mass(self, effects: Sequence[Effect]) -> np.ndarray:
+        """(K, n_v, n_v) by which the mass matrix is larger with effects on a robot's
+        joints and links: what they need for each acceleration alone, beyond what they
+        need at rest."""
+        m = self.motion
+        still, out = np.zeros_like(m.v), np.zeros_like(self._M)
+        for e in effects:
+            at_rest = self._added(e, replace(m, v=still, vd=still))
+            for i in range(m.v.shape[1]):
+                vd = np.zeros_like(still)
+                vd[:, i] = 1.0
+                out[:, :, i] += self._added(e, replace(m, v=still, vd=vd)) - at_rest
+        return out
 
     def in_newtons(self, left: np.ndarray) -> np.ndarray:
         """Rows (K, rows) of equations as left() gives them, in N and N m."""

@@ -25,9 +25,10 @@ from makebreak.gap.problem import (
     rms,
 )
 from makebreak.gap.residuals.contact_candidates import ContactCandidates
-from makebreak.gap.residuals.contact_dynamics import WRENCHED
+from makebreak.gap.residuals.contact_dynamics import OF_ROBOTS, WRENCHED
 from makebreak.gap.residuals.lying_on_faces import lying_on_faces
 from makebreak.gap.residuals.mechanism import link_changes
+from makebreak.gap.residuals.mechanism_candidates import tolerances
 from makebreak.gap.residuals.objects import unexplained_in_windows
 from makebreak.gap.residuals.permitted_contacts import Shift
 from makebreak.gap.residuals.pose_times import earlier
@@ -50,6 +51,7 @@ from makebreak.gap.simulation.measure import gap_measure, series_of
 from makebreak.gap.thresholds import AGREEMENT_RMS_MAX
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, sliding_joints
+from makebreak.models.effects.objects import MASS
 from makebreak.models.scene import Scene
 
 PLACED = 1e-3  # A camera's place [m],
@@ -347,6 +349,23 @@ class ContactProblem(ContactCandidates, GapProblem):
                     steps.append(float(np.median(np.diff(t))))
         return float(np.median(steps))
 
+    def replaced(self, effects: Sequence[Effect]) -> np.ndarray | None:
+        """The mass of a link that is fitted, and that of the heaviest link beside gains
+        of all drives or another inertia of the robot: with it free all forces would
+        shrink, or grow, together, and with them what noise leaves."""
+        places = {at for e in effects if e.kind in OF_ROBOTS for at in e.at}
+        if not places and not self._gains_are_free(effects):
+            return None
+        links = self.dynamics.links()
+        places.add(max(links, key=lambda at: links[at]))
+        mine = {f"{MASS} of {at}, mass" for at in places}
+        return np.array([name in mine for name in self.nuisances().names], bool)
+
+    def _gains_are_free(self, effects: Sequence[Effect]) -> bool:
+        driven = {j for j, by in self.by.items() if by not in ("", "passive")}
+        gains = {at for e in effects if KINDS[e.kind].path == "gain" for at in e.at}
+        return bool(driven) and driven <= gains
+
     def widened(self, end: Fitted, k: int) -> tuple[dict[str, float], tuple[str, ...]]:
         """A patch's side that nothing slid across can be anywhere until something did,
         and what sticks says of friction only that it is not less: each is moved by ever
@@ -366,6 +385,10 @@ class ContactProblem(ContactCandidates, GapProblem):
         elif effect.kind == "object_size":  # Another face is met: its slopes jump.
             moves = {"scale": tuple(x * p["scale"] for x in SHARES)}
         else:
+            if KINDS[effect.kind].path == "gain" and self._gains_are_free(end.effects):
+                # What the masses are known to, a gain of all drives is known to.
+                share = tolerances(self.scene)[MASS].size
+                std = {n: float(np.hypot(x, share * p[n])) for n, x in std.items()}
             return std, ()
         if effect.kind != "friction_patch" and not self._train.all():
             asked = ~self.train()

@@ -9,6 +9,7 @@ import numpy as np
 
 from makebreak.gap.residuals.felt_walls import FeltWalls
 from makebreak.gap.simulation.windows import LARGEST
+from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 
 BLOCK_SEC = 0.6  # In which a tool goes a few centimetres.
@@ -44,13 +45,21 @@ class ContactRows(FeltWalls):
     def weighed_alike(self, one: Sequence[Effect], other: Sequence[Effect]):
         """A heavier body makes more noise of the same accelerations: by its own weights
         each of two models that are both below the noise seems better the heavier it is.
+        Not so where a drive's gain is another: all forces are in another unit then, the
+        noise with them, and by the weights of one model the one with the smaller forces
+        would leave less. Of these each is weighed by its own.
         """
+        if _gains(one) != _gains(other):
+            return [(self._own(one), self._own(other))]
 
         def row(effects, weights):
             r = self._flat(self.left(effects, weighed_as=weights))
             return np.clip(r, -LARGEST, LARGEST)
 
         return [(row(one, w), row(other, w)) for w in (one, other)]
+
+    def _own(self, effects: Sequence[Effect]) -> np.ndarray:
+        return np.clip(self._flat(self.left(effects)), -LARGEST, LARGEST)
 
     def base(self) -> np.ndarray:
         if self._base is None:
@@ -91,3 +100,11 @@ class ContactRows(FeltWalls):
     def parts(self) -> np.ndarray:
         number = np.array([t.recording for t in self.tracks])
         return self._of_rows(number[self.means.episode])
+
+
+def _gains(effects: Sequence[Effect]) -> set[tuple[tuple[str, ...], float]]:
+    """(drives, gain) of all effects that make drives stronger or weaker."""
+    return {
+        (tuple(e.at), e.parameters["gain"])
+        for e in effects if KINDS[e.kind].path == "gain"
+    }  # fmt: skip

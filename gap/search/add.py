@@ -198,13 +198,16 @@ def _choices(
         sizes = [best.candidate.size]
     fixed = best.fixed()
     is_group = len(new) > 1 and best.candidate.kind in KINDS
+    both_needed = rivals.are_both_needed(best)
     return tuple(
         Choice(
             effect, {}, base, fit.score,
             runner.ranked.candidate.name if runner else "",
             runner.fit.score / fit.score - 1.0 if runner else np.inf,
-            ties, fixed[k], sizes[k], is_group, rivals.are_both_needed(best),
-            len(new) > 1 and not is_group,
+            ties, fixed[k], sizes[k], is_group, both_needed,
+            len(new) > 1 and not is_group, needed_beside=tuple(
+                (e.kind, tuple(e.at)) for e in new if both_needed and e is not effect
+            ),
         )
         for k, effect in enumerate(new)
     )  # fmt: skip

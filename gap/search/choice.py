@@ -8,7 +8,7 @@ import numpy as np
 
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Candidate, Fitted, GapProblem, Nuisances
-from makebreak.gap.result import Considered
+from makebreak.gap.result import Considered, RivalSet
 from makebreak.gap.search.screen import Ranked
 from makebreak.gap.thresholds import (
     MEMBER_Z,
@@ -36,7 +36,9 @@ class Choice:
     that a fit leaves at neutral. size: parameters that a fit chooses. in_group: one of
     several places of its kind that were added at once. of_two: it and its rival are
     both needed. paired: it was added at once with an effect of another kind. or_more:
-    parameters that may as well be any larger.
+    parameters that may as well be any larger. needed_beside: (kind, place) of rivals
+    beside which it is needed, so that they are no ties. sets: others that explain as
+    much in the place of it and another one.
     """
 
     effect: Effect
@@ -52,6 +54,8 @@ class Choice:
     of_two: bool = False
     paired: bool = False
     or_more: tuple[str, ...] = ()
+    needed_beside: tuple[tuple[str, tuple[str, ...]], ...] = ()
+    sets: tuple[RivalSet, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +75,18 @@ class Selection:
     table: tuple[Considered, ...] = ()
     beyond: tuple[tuple[str, float], ...] = ()
     far: bool = False
+
+    def __post_init__(self):
+        # Ties of two effects go with either of them.
+        there = places(self.choices)
+        whole = [
+            replace(c, sets=tuple(
+                s for s in c.sets
+                if all((e.kind, tuple(e.at)) in there for e in s.beside)
+            )) if c.sets else c
+            for c in self.choices
+        ]  # fmt: skip
+        object.__setattr__(self, "choices", tuple(whole))
 
     def screen(self, problem: GapProblem) -> Screen:
         """With which the end was fitted."""

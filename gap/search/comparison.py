@@ -26,6 +26,7 @@ from makebreak.gap.thresholds import (
     MODEL_ERROR_SHARE,
     NOISE_RMS_MAX,
     NUISANCE_EXCESS,
+    P_VALUE_MIN,
     REFIT_LOSS_MAX,
     RIVAL_ERROR_RATIO,
     RIVAL_P_VALUE,
@@ -170,6 +171,12 @@ class Comparison:
             a, b = np.hypot(rms(without[mine]), off), np.hypot(rms(with_[mine]), off)
             found[int(k)] = 1.0 - b / a
         return found
+
+    def is_alike(self, rival: Fitted, fit: Fitted) -> bool:
+        """Whether a rival leaves no more, or no more block by block than by chance."""
+        if rival.score <= fit.score:
+            return True
+        return paired(rival.left, fit.left, self.train) > P_VALUE_MIN
 
     def is_worse(self, rival: Fitted, fit: Fitted, more: int) -> bool:
         """Whether a rival that seems as good is clearly worse: there is less evidence

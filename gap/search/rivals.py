@@ -34,6 +34,8 @@ from makebreak.gap.thresholds import (
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 
+NO_MASS = 0.01  # Of a body's mass: what is left at the end of its range.
+
 
 def are_rivals(one: Trial, other: Trial) -> bool:
     """Whether two candidates may stand for each other: the catalogue says so, or they
@@ -61,28 +63,50 @@ class Rivals:
         self, chosen: Sequence[Choice], one: Trial, other: Trial
     ) -> Together | None:
         """None where one of them has more parameters or goes to the end of its range,
-        or weights do not depend on the model, so that nothing is gained by it."""
+        or weights do not depend on the model, so that nothing is gained by it. None of
+        a drive's gain beside an inertia either: all forces can become small together,
+        and would leave less by any weights."""
         for _, r in (one, other):
             if r.candidate.members or r.candidate.size != 1 or r.candidate.fixed:
                 return None
+        kinds = [KINDS[t.ranked.candidate.kind] for t in (one, other)]
+        if any(k.path == "gain" for k in kinds) and any(k.is_inertia for k in kinds):
+            return None
         key = (id(one.ranked), id(other.ranked))
         if key not in self._known:
+            nothing = _neutral(one.ranked), _neutral(other.ranked)
             try:
                 found = fit_together(
                     self._search.problem, self._search.nuisances,
                     [c.effect for c in chosen], fixed_parameters(chosen),
-                    one.fit.effects[-1], other.fit.effects[-1],
-                    (_neutral(one.ranked), _neutral(other.ranked)),
+                    one.fit.effects[-1], other.fit.effects[-1], nothing,
                 )  # fmt: skip
             except (ValueError, RuntimeError):
                 found = None
             # One that goes to the end of its range would go on, and the other along
             # with it: what each is beside the other is not known.
-            if found is not None and _goes_to_an_end(found.fitted):
+            if found is not None and self._goes_to_an_end(found.fitted, nothing):
                 found = None
             # The pair is kept too, so that no other object gets its id.
             self._known[key] = found, one, other
         return self._known[key][0]
+
+    def _goes_to_an_end(self, both: Fitted, nothing: tuple[Effect, Effect]) -> bool:
+        """Whether one of the last two effects is within a deviation of its highest
+        value, or of a body without mass. nothing: the two as they are in the scene."""
+        two = zip(both.effects[-2:], both.std[-2:], nothing, strict=True)
+        for effect, std, now in two:
+            least = self._search.problem.dynamics.least(effect.kind, effect.at)
+            for name, value in effect.parameters.items():
+                far = std.get(name, 0.0)
+                if value + far >= highest(effect.kind, name):
+                    return True
+                low = least.get(name, 0.0)
+                mass = now.parameters[name] - low  # As it is in the scene.
+                is_mass = KINDS[effect.kind].parameter(name).unit == "kg" and mass > 0.0
+                if is_mass and value - far <= low + NO_MASS * mass:
+                    return True
+        return False
 
     def least_lost(self) -> float:
         """What laws, which are approximations, may leave of the gap [noise]. (Where a
@@ -215,7 +239,7 @@ def still_tied(
     search: Comparison, chosen: Sequence[Choice], current: Fitted, k: int
 ) -> tuple[Effect, ...]:
     """The ties of the k-th effect that do as well as it beside all other effects."""
-    if len(chosen) < 2:
+    if len(chosen) < 2 and not chosen[k].paired:
         return chosen[k].ties
     screen = search.screen(current.r, current.fit.train)
     fixed = fixed_parameters(chosen)
@@ -231,10 +255,9 @@ def still_tied(
         near = search.error(fit.score) <= (1.0 + SAME_ERROR) * search.error(
             current.score
         )
-        alike = paired(fit.left, current.left, search.train) > P_VALUE_MIN
         more = identifiable(current, k) - identifiable(fit, k)
         worse = search.is_worse(fit, current, more) or search.is_louder(fit, current)
-        if near and alike and not worse:
+        if near and search.is_alike(fit, current) and not worse:
             tied.append(fit.effects[k])
     return tuple(tied)
 
@@ -243,8 +266,8 @@ def with_rivals_of_pairs(
     search: Comparison, chosen: Sequence[Choice], current: Fitted
 ) -> list[Choice]:
     """The choices with rivals of those kinds that were added two at once, which were
-    not compared with others: the best candidates in the place of each, beside all
-    other effects."""
+    not compared with others, whether both are left or one: the best candidates in the
+    place of each, beside all other effects."""
     taken = places(chosen)
     free = [
         c for c in search.problem.candidates(search.nuisances, current)
@@ -263,6 +286,7 @@ def with_rivals_of_pairs(
                 and choice.effect.kind not in KINDS[r.candidate.kind].contains
             ]  # fmt: skip
             known = {(t.kind, tuple(t.at)) for t in choice.ties}
+            known |= set(choice.needed_beside)
             for c in near[:PAIR_RIVALS_MAX]:
                 if (c.kind, c.at) in known:
                     continue
@@ -294,17 +318,6 @@ def in_place_of(
     search.say(f"  {candidate.name} in place of {replaced}: {fit.score:.3g}")
     sane = candidate.is_sane(fit.effects[k : k + 1])
     return Trial(fit, ranked) if sane and np.isfinite(fit.score) else None
-
-
-def _goes_to_an_end(both: Fitted) -> bool:
-    """Whether one of the last two effects is within a deviation of its highest
-    value."""
-    last = zip(both.effects[-2:], both.std[-2:], strict=True)
-    return any(
-        value + std.get(name, 0.0) >= highest(effect.kind, name)
-        for effect, std in last
-        for name, value in effect.parameters.items()
-    )
 
 
 def _neutral(ranked: Ranked) -> Effect:

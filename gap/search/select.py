@@ -12,6 +12,7 @@ The stages, each in a file of its own:
     rivals.py       needed instead, both needed, or a tie
     pairs.py        two effects at once
     merge.py        one effect in the place of two
+    sets.py         ties of two effects together
     refine.py       a further parameter of an effect that is named
     own_values.py   one value for each joint
     drop.py         what is not needed, or not certain
@@ -36,6 +37,7 @@ from makebreak.gap.search.drop import drop_needless, keep_certain, simplify
 from makebreak.gap.search.forward import forward
 from makebreak.gap.search.own_values import with_own_values
 from makebreak.gap.search.rivals import still_tied, with_rivals_of_pairs
+from makebreak.gap.search.sets import with_rival_sets
 from makebreak.models.effects.kind import Effect
 
 
@@ -55,12 +57,13 @@ def select(
     if chosen:
         chosen, current = keep_certain(search, chosen, current)
     chosen, current = _reweighed(search, chosen, current)
-    if len(chosen) > 1 and any(c.paired for c in chosen):
+    if any(c.paired for c in chosen):
         chosen = with_rivals_of_pairs(search, chosen, current)
     chosen = [
         replace(c, ties=still_tied(search, chosen, current, k))
         for k, c in enumerate(chosen)
     ]
+    chosen = with_rival_sets(search, chosen, current)
     beyond = search.nuisances_beyond(current)
     far = bool(beyond) or not is_plausible(current.b, search.nuisances.prior)
     return Selection(

@@ -213,6 +213,11 @@ class EffectKind:
     added: Callable[..., Any] | None = None
     on_top: Callable[..., Any] | None = None
 
+    @property
+    def is_inertia(self) -> bool:
+        """Whether it changes what forces accelerate: a mass, or a moment of inertia."""
+        return any(p.unit in ("kg", "kg m2") for p in self.parameters)
+
     def parameter(self, name: str) -> Parameter:
         for each in self.parameters:
             if each.name == name:
