@@ -49,6 +49,11 @@ def scene_file(text: str, option: str) -> str:
     shipped = scenes()
     if _scene_name(text) in shipped:
         return str(shipped[_scene_name(text)])
+    if text in experiments.EXPERIMENTS:
+        raise ValueError(
+            f"{option}: {text} is an experiment, expected a scene: the model.yaml of "
+            f"its run, or one of {', '.join(shipped)}"
+        )
     hint = f", or a name of `makebreak list`; {nearest(text, shipped)}"
     if Path(text).suffix:  # A file was meant.
         hint = ""

@@ -90,6 +90,10 @@ def test_every_verdict_is_a_run_that_is_done(workflow, case, verdict, monkeypatc
         ([], "SCENE"),
         (["scene.yaml"], "RECORDING"),
         (["no_such", "run.csv"], 'SCENE: got "no_such", expected a scene file'),
+        (
+            ["contact_learning", "run.csv"],
+            "SCENE: contact_learning is an experiment, exp",
+        ),
         (["scene.yaml", "none.csv"], "recording none.csv does not exist"),
         (["scene.yaml", "."], "recording . is a folder, expected a file, a ROS bag"),
         (["run.csv", "run.csv"], "run.csv is a recording, expected the scene"),
