@@ -42,6 +42,7 @@ from makebreak.gap.problem import (
     share_left,
 )
 from makebreak.gap.residuals.command_times import set_command_times
+from makebreak.gap.residuals.contact_problem import ContactProblem
 from makebreak.gap.residuals.driven import DrivenProblem, is_driven, sticks
 from makebreak.gap.residuals.impacts import ImpactProblem, runs_against, without_contact
 from makebreak.gap.residuals.late_poses import contact_problem
@@ -53,7 +54,7 @@ from makebreak.gap.residuals.objects import (
     TouchProblem,
     point_on_face_of,
 )
-from makebreak.gap.residuals.pressing import PressingProblem, presses
+from makebreak.gap.residuals.pressing import PressingProblem, presses, push_each_other
 from makebreak.gap.residuals.sap_lift import sap_lift
 from makebreak.gap.residuals.tool_weight import as_used, check_tool_weight
 from makebreak.gap.result import AGREES, GapMeasure, GapResult, JudgedChannel
@@ -136,8 +137,9 @@ def run_gap(
     checks += check_tool_weight(dynamics, parts.decided)
     is_mechanism = _is_mechanism(dynamics, recordings)
     # An impact would be smeared by means over rows.
-    meets = is_mechanism and (
-        runs_against(dynamics, parts.decided) or presses(dynamics, parts.decided)
+    meets = is_mechanism and any(
+        asked(dynamics, parts.decided)
+        for asked in (runs_against, presses, push_each_other)
     )
     decided, reported, done = _conditioned(parts, dynamics, is_mechanism and not meets)
     seconds["checks"] = clock.lap()
@@ -218,6 +220,11 @@ def problem_for(
         one that does.
     """
     if _is_mechanism(dynamics, recordings):
+        if push_each_other(dynamics, recordings):
+            try:
+                return _contact_problem(scene, recordings)
+            except DoesNotFit:  # Too short, or it is no contact that they show.
+                pass
         if presses(dynamics, recordings):
             try:
                 pressing = PressingProblem(scene, recordings)
@@ -248,8 +255,7 @@ def problem_for(
         return mechanism, [*touches, *finding, *mechanism.push_findings()]
     if any(joint.num_velocities() for joint in one_dof_joints(dynamics.plant)):
         try:
-            contact = contact_problem(scene, recordings)
-            return contact, sap_lift(contact) + point_on_face(contact, contact.lying())
+            return _contact_problem(scene, recordings)
         except DoesNotFit:  # Not the whole motion is measured, or nothing touches.
             pass
         try:
@@ -262,6 +268,13 @@ def problem_for(
     except DoesNotFit:  # More than one free body, or other shapes: by Drake's steps.
         scene, finding = _settle_step(scene, recordings, dynamics, jobs)
         return RolloutProblem(scene, recordings), finding
+
+
+def _contact_problem(
+    scene: Scene, recordings: Sequence[Recording]
+) -> tuple[ContactProblem, list[Finding]]:
+    contact = contact_problem(scene, recordings)
+    return contact, sap_lift(contact) + point_on_face(contact, contact.lying())
 
 
 def conclude(

@@ -22,6 +22,7 @@ from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.ground import PLACE
 from makebreak.models.effects.kind import Effect
+from makebreak.models.effects.objects import MASS
 
 CELL, MOST_CELLS = 0.015, 20  # A side of the cells in which a patch is looked for [m].
 LEAST_CELLS = 4
@@ -121,6 +122,15 @@ class ContactCandidates(ContactRows):
                 yield "contact_friction", at, 1, ("friction",), (), steps
         for body in self.bodies:
             yield from self._of_body(body)
+        for body in self.objects:
+            yield from self._mass_of(body)
+            com = self.dynamics.now("object_com", [body])
+            moved = {a: {**com, a: com[a] + OFFSETS[0]} for a in com}
+            axes = tuple(a for a in com if self._shows("object_com", body, moved[a]))
+            rest = tuple(a for a in com if a not in axes)
+            steps = [[(d, {**com, a: com[a] + d}) for a in axes] for d in OFFSETS]
+            if axes:
+                yield "object_com", body, len(axes), axes, rest, steps
         for at in self.dynamics.places("plane_tilt"):
             zero = {"roll": 0.0, "pitch": 0.0}
             steps = [[(0.004, {**zero, a: 0.004}) for a in zero]]
@@ -154,10 +164,19 @@ class ContactCandidates(ContactRows):
                 return s.friction
         return 0.0
 
-    def _of_body(self, body: str):
-        mass = self.dynamics.now("object_mass", [body])["mass"]
+    def _shows(self, kind: str, at: str, parameters: dict[str, float]) -> bool:
+        """Whether a single effect changes anything."""
+        r = self._try((), Effect(kind, [at], parameters))
+        return r is not None and bool(np.abs(r - self.base()).max() > 1e-3)
+
+    def _mass_of(self, body: str):
+        mass = self.dynamics.now(MASS, [body])["mass"]
         steps = [[((f - 1.0) * mass, {"mass": f * mass})] for f in MASSES]
-        yield "object_mass", body, 1, ("mass",), (), steps
+        yield MASS, body, 1, ("mass",), (), steps
+
+    def _of_body(self, body: str):
+        yield from self._mass_of(body)
+        mass = self.dynamics.now(MASS, [body])["mass"]
         com = self.dynamics.now("object_com", [body])
         steps = [[(d, {**com, a: com[a] + d}) for a in "xy"] for d in OFFSETS]
         yield "object_com", body, 2, ("x", "y"), ("z",), steps

@@ -254,13 +254,17 @@ class ContactDynamics(PermittedContacts):
                 for joint in find_joints(e, self.plant):
                     gain[joint.velocity_start()] = e.parameters["gain"]
         for body, own in bodies.items():
-            if body not in self.bodies:
+            if body in self.bodies:
+                i_v = self.bodies[body][1]
+                slides, turns = np.arange(i_v + 3, i_v + 6), np.arange(i_v, i_v + 3)
+            elif body in self.objects:
+                slides, turns = self.objects[body]
+            else:
                 continue  # A link as a nuisance: its mass is off by little.
-            i_v = self.bodies[body][1]
             before, more = self._ten(body), self._more_inertia(body, own)
-            inertia[i_v + 3 : i_v + 6] = 1.0 + more[0] / before[0]
+            inertia[slides] = 1.0 + more[0] / before[0]
             trace = slice(4, 7)  # Of the inertia: it has no axes.
-            inertia[i_v : i_v + 3] = 1.0 + more[trace].sum() / before[trace].sum()
+            inertia[turns] = 1.0 + more[trace].sum() / before[trace].sum()
         held = self._held(effects)
         links = [e for e in effects if e.kind in OF_ROBOTS]
         of_links = tuple((e.kind, *e.at, *sorted(e.parameters.items())) for e in links)

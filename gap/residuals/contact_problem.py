@@ -282,7 +282,7 @@ class ContactProblem(ContactCandidates, GapProblem):
                 finally:
                     self.means.wrench = kept
         for name, effect, size in link_changes(self.dynamics, self.scene):
-            if set(effect.at) & set(self.bodies):
+            if set(effect.at) & {*self.bodies, *self.objects}:
                 continue
             add(name, self._unclipped([effect]), size, size)
         for body in self.bodies:

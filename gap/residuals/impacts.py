@@ -7,7 +7,7 @@ some of the free motion between, which show friction and drives. A window begins
 the touch, from a state that is smoothed on that side alone.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -188,14 +188,25 @@ def positions(dynamics: SceneDynamics, recording: Recording) -> np.ndarray:
 
 
 def nearest(shapes: ContactShapes, dynamics: SceneDynamics, q) -> np.ndarray:
-    """(n,) distance of the nearest pair."""
+    """(n,) distance of the nearest pair of a link and what is fixed."""
+
+    def counts(a: int, b: int) -> bool:
+        return (a in shapes.anchored) != (b in shapes.anchored)
+
+    return nearest_of(shapes, dynamics, q, counts)
+
+
+def nearest_of(
+    shapes: ContactShapes,
+    dynamics: SceneDynamics,
+    q: np.ndarray,
+    counts: Callable[[int, int], bool],
+) -> np.ndarray:
+    """(n,) distance of the nearest of the pairs of bodies that count."""
     if not len(q):
         return np.zeros(0)
-    slots = shapes.slots(poses_of(dynamics.plant, q, shapes), np.inf)
-    each = [
-        s.phi for s in slots if (s.a in shapes.anchored) != (s.b in shapes.anchored)
-    ]
-    return np.min(each, axis=0) if each else np.full(len(q), np.inf)
+    slots = shapes.slots(poses_of(dynamics.plant, q, shapes), np.inf, counts)
+    return np.min([s.phi for s in slots], axis=0) if slots else np.full(len(q), np.inf)
 
 
 class ImpactWindows(WindowModel):

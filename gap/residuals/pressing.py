@@ -11,6 +11,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from pydrake.multibody.tree import BodyIndex
 
 from makebreak.gap.data.pieces import excerpt
 from makebreak.gap.data.recording import Recording
@@ -29,13 +30,19 @@ from makebreak.gap.residuals.fixed_faces import (
     PASSED,
     REACH,
 )
-from makebreak.gap.residuals.impacts import MOST_SHARE, nearest, positions, walls_of
+from makebreak.gap.residuals.impacts import (
+    MOST_SHARE,
+    nearest,
+    nearest_of,
+    positions,
+    walls_of,
+)
 from makebreak.gap.residuals.lying_on_faces import pressed_with_corners
 from makebreak.gap.residuals.mechanism_candidates import loads
 from makebreak.gap.residuals.permitted_contacts import Geometry, Shift
 from makebreak.gap.residuals.touching import MEETS
 from makebreak.gap.residuals.wrench_sensor import FORCE
-from makebreak.gap.simulation.contact_shapes import Slot
+from makebreak.gap.simulation.contact_shapes import ContactShapes, Slot
 from makebreak.gap.simulation.face_supports import LiesOn
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.contact import STIFFNESS
@@ -108,6 +115,32 @@ def presses(dynamics: SceneDynamics, recordings: Sequence[Recording]) -> bool:
         lasting += _rows_of_lasting(touching[first:last], track.time)
         first = last
     return lasting > FELT_SHARE * len(touching)
+
+
+def push_each_other(dynamics: SceneDynamics, recordings: Sequence[Recording]) -> bool:
+    """Whether what moves on joints touches another such thing, of another model, for a
+    while: a finger an object that slides on a rail. Links of one robot do not count:
+    their shapes often overlap."""
+    try:
+        shapes = ContactShapes(dynamics.loaded, hulls=False)
+    except DoesNotFit:
+        return False
+    models = {
+        k: dynamics.plant.get_body(BodyIndex(k)).model_instance()
+        for k in shapes.bodies()
+    }
+
+    def counts(a: int, b: int) -> bool:
+        return not {a, b} & shapes.anchored and models[a] != models[b]
+
+    lasting = whole = 0
+    for recording in recordings:
+        q = positions(dynamics, recording)
+        step = max(len(q) // 4000, 1)
+        apart = nearest_of(shapes, dynamics, q[::step], counts)
+        lasting += _rows_of_lasting(apart < MEETS, recording.time[::step])
+        whole += len(apart)
+    return lasting > FELT_SHARE * whole
 
 
 def thinned(on: np.ndarray, force: np.ndarray, episode: np.ndarray) -> np.ndarray:

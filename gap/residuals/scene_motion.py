@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import BodyIndex, RigidBody
 
 from makebreak.gap.data.recording import Episode, Recording
 from makebreak.gap.does_not_fit import DoesNotFit
@@ -14,7 +15,7 @@ from makebreak.gap.simulation.contact_shapes import ContactShapes, poses_of
 from makebreak.gap.simulation.windows import TURN, spin_of
 from makebreak.models.drives import law_of
 from makebreak.models.dynamics import SceneDynamics
-from makebreak.models.effects.kind import full_name, one_dof_joints
+from makebreak.models.effects.kind import full_name, one_dof_joints, sliding_joints
 from makebreak.models.scene import Scene
 from makebreak.models.scene_schema import COMMANDS_OF
 from makebreak.systems.numerics.smoother import Smoothed, blur_sec, smooth_filtered
@@ -45,6 +46,7 @@ class SceneMotion:
 
     Attributes:
         joints, bodies: {name: (index in q, in v)} of joints and free bodies.
+        objects: {link that nothing drives: see _read_objects}.
         coordinates: (n_v,) names. by, sensors, n_wrench, extra: see the methods.
         tracks: the episodes, smoothed; their rows one after the other are those of all.
         half: half width of a test function [s].
@@ -61,6 +63,7 @@ class SceneMotion:
         self._read_coordinates()
         self._check_positions()
         self._read_drives()
+        self._read_objects()
         self.sensors = wrench_sensors(self.plant, self.recordings)
         self.n_wrench = sum(len(sensor.names) for sensor in self.sensors)
         self._read_extra()
@@ -135,6 +138,40 @@ class SceneMotion:
                 self.by[joint] = "measured"
             else:
                 self.by[joint] = "" if joint in act.joints else "passive"
+
+    def _read_objects(self) -> None:
+        """objects: {link with shapes that passive joints alone move: indices in v of
+        those that slide, and that turn}. It is pushed as a free body is, and its mass
+        is no better known."""
+        plant, slides = self.plant, sliding_joints(self.plant)
+        passive: dict[str, list[int]] = {}
+        driven: set[str] = set()
+        for index in plant.GetJointIndices():
+            if not plant.get_joint(index).num_velocities():
+                continue
+            name = full_name(plant, plant.get_joint(index))
+            for k in plant.GetBodiesKinematicallyAffectedBy([index]):
+                body = full_name(plant, plant.get_body(k))
+                if self.by.get(name) == "passive":
+                    passive.setdefault(body, []).append(self.joints[name][1])
+                else:  # Or it floats.
+                    driven.add(body)
+        shown = {
+            full_name(plant, self._heaviest_welded_to(BodyIndex(k)))
+            for k in self.shapes.bodies()
+        }
+        sliding = {self.joints[name][1] for name in slides if name in self.joints}
+        self.objects = {
+            body: (np.array([i for i in index if i in sliding], int),
+                   np.array([i for i in index if i not in sliding], int))
+            for body, index in passive.items() if body in shown and body not in driven
+        }  # fmt: skip
+
+    def _heaviest_welded_to(self, index: BodyIndex) -> RigidBody:
+        """One rigid body has one mass, wherever its shapes are."""
+        body = self.plant.get_body(index)
+        welded = self.plant.GetBodiesWeldedTo(body)
+        return max(welded, key=lambda each: each.default_mass())
 
     def _read_extra(self) -> None:
         """extra: redundant channels, measured rates and efforts that must agree with
