@@ -21,6 +21,7 @@ from makebreak.gap.simulation.windows import LARGEST
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.ground import PLACE
+from makebreak.models.effects.joints import ROTOR
 from makebreak.models.effects.kind import Effect
 from makebreak.models.effects.objects import MASS
 
@@ -233,8 +234,8 @@ class ContactCandidates(ContactRows):
                 i = index.get(at)
                 if i is None or self.by[at] == "":
                     continue
-                if entry.path and self.by[at] == "passive":
-                    continue
+                if self.by[at] == "passive" and (entry.path or kind == ROTOR):
+                    continue  # It has no motor.
                 now = self.dynamics.now(kind, [at]).get(p.name, 0.0)
                 force = SMALL * max(effort[i], 1e-3 * effort.max() + 1e-9)
                 step = {

@@ -11,7 +11,6 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from pydrake.multibody.tree import BodyIndex
 
 from makebreak.gap.data.pieces import excerpt
 from makebreak.gap.data.recording import Recording
@@ -46,7 +45,7 @@ from makebreak.gap.simulation.contact_shapes import ContactShapes, Slot
 from makebreak.gap.simulation.face_supports import LiesOn
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.contact import STIFFNESS
-from makebreak.models.effects.kind import Effect
+from makebreak.models.effects.kind import Effect, one_dof_joints
 from makebreak.models.scene import Scene
 
 FELT_SHARE = 0.03  # Of the rows: a wrench that is felt in more of them.
@@ -118,20 +117,23 @@ def presses(dynamics: SceneDynamics, recordings: Sequence[Recording]) -> bool:
 
 
 def push_each_other(dynamics: SceneDynamics, recordings: Sequence[Recording]) -> bool:
-    """Whether what moves on joints touches another such thing, of another model, for a
-    while: a finger an object that slides on a rail. Links of one robot do not count:
-    their shapes often overlap."""
+    """Whether what moves on joints touches what moves on others, for a while: a finger
+    an object that slides on a rail. Links that one joint moves do not count: shapes of
+    one robot often overlap."""
     try:
         shapes = ContactShapes(dynamics.loaded, hulls=False)
     except DoesNotFit:
         return False
-    models = {
-        k: dynamics.plant.get_body(BodyIndex(k)).model_instance()
-        for k in shapes.bodies()
-    }
+    plant = dynamics.plant
+    moved_by: dict[int, set[int]] = {k: set() for k in shapes.bodies()}
+    for joint in one_dof_joints(plant):
+        for body in plant.GetBodiesKinematicallyAffectedBy([joint.index()]):
+            if joint.num_velocities() and int(body) in moved_by:
+                moved_by[int(body)].add(int(joint.index()))
 
     def counts(a: int, b: int) -> bool:
-        return not {a, b} & shapes.anchored and models[a] != models[b]
+        both = moved_by[a], moved_by[b]
+        return all(both) and not set.intersection(*both)
 
     lasting = whole = 0
     for recording in recordings:

@@ -107,7 +107,7 @@ def _change_rotor(old: Effect, new: Effect, plant: MultibodyPlant, context) -> N
 
 def rotor(joint: str, inertia: float) -> Effect:
     """A rotor [kg m2] at a joint, as an effect."""
-    return Effect("rotor_inertia", [joint], {"inertia": inertia})
+    return Effect(ROTOR, [joint], {"inertia": inertia})
 
 
 # Effects of these kinds may be negative where their sum at a joint is not.
@@ -342,6 +342,7 @@ def _spring_added(effect, model, motion) -> np.ndarray:
     return one.columns @ (p["stiffness"] * np.array([1.0, p["rest"]]))
 
 
+ROTOR = "rotor_inertia"
 KINDS = {
     "joint_viscous_damping": EffectKind(
         at="joint",
@@ -451,7 +452,7 @@ KINDS = {
         joint_numbers=_numbers("coefficient"),
         signature=_drag_signature,
     ),
-    "rotor_inertia": EffectKind(
+    ROTOR: EffectKind(
         at="joint",
         parameters=(Parameter("inertia", "kg m2", -20.0, 20.0),),
         says="{at} turns a rotor with {inertia} (reflected at the joint) that the "
