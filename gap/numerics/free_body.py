@@ -73,13 +73,26 @@ class FreeBodies:
     mutual (n, n, 6): of two spheres of different bodies, all bodies' spheres in a row,
     the first one before the second: as FreeBody.pairs has them, with the share of the
     contact point that lies on the first one's surface; 0 where they do not touch.
+    boxes (k, 16): boxes of bodies, as FreeBody.fixed has them, in the body's frame, and
+    its number. carried (n, k, 6): of each sphere and a box of another body, as
+    FreeBody.pairs; 0 where they do not touch.
     """
 
     each: tuple[FreeBody, ...]
     mutual: np.ndarray
+    boxes: np.ndarray = field(default_factory=lambda: np.zeros((0, 16)))
+    carried: np.ndarray | None = None
 
     def __post_init__(self):
         n = sum(len(body.spheres) for body in self.each)
+        if self.carried is None:
+            object.__setattr__(self, "carried", np.zeros((n, len(self.boxes), 6)))
+        assert self.carried is not None
+        if self.carried.shape != (n, len(self.boxes), 6):
+            raise ValueError(
+                f"FreeBodies.carried is {self.carried.shape}, expected "
+                f"{(n, len(self.boxes), 6)}"
+            )
         if self.mutual.shape != (n, n, 6):
             raise ValueError(
                 f"FreeBodies.mutual is {self.mutual.shape}, expected {(n, n, 6)}"
@@ -128,6 +141,7 @@ def simulate_all(
         np.concatenate([body.pairs for body in each]),
         np.concatenate([body.levers for body in each]),
         np.concatenate([_rims(body) for body in each]), bodies.mutual,
+        bodies.boxes, bodies.carried,
         owned([body.forces for body in each], 6),
         np.array([body.drag for body in each]), each[0].slip, each[0].fade,
         owned([body.patches for body in each], 6), max_step, tol,
@@ -141,6 +155,11 @@ def _rims(body: FreeBody) -> np.ndarray:
 def placed(pose, points) -> np.ndarray:
     """(n, 3) points of the body's frame (n, 3) in world; pose (7,) as in `start`."""
     return np.asarray(pose[4:7]) + points @ _matrix(np.asarray(pose[:4], float)).T
+
+
+def placed_in(pose, points) -> np.ndarray:
+    """(n, 3) points of the world (n, 3) in the body's frame: placed() turned round."""
+    return (points - np.asarray(pose[4:7])) @ _matrix(np.asarray(pose[:4], float))
 
 
 def lowest_gap(body: FreeBody, pose) -> float:
@@ -313,8 +332,60 @@ def _meet(F, T, s, c, spheres, owner, i, j, law, slip):
 
 
 @njit(cache=True)
+def _in_world(s, turned, com, boxes):
+    """(k, 15) boxes of bodies as fixed shapes are given, where they are now."""
+    found = np.empty((len(boxes), 15))
+    for k in range(len(boxes)):
+        o = int(boxes[k, 15])
+        R = turned[o]
+        for i in range(3):
+            found[k, 9 + i] = s[o, 4 + i]
+            found[k, 12 + i] = boxes[k, 12 + i]
+            for j in range(3):
+                found[k, 9 + i] += R[i, j] * (boxes[k, 9 + j] - com[o, j])
+                found[k, 3 * i + j] = (
+                    R[i, 0] * boxes[k, j]
+                    + R[i, 1] * boxes[k, 3 + j]
+                    + R[i, 2] * boxes[k, 6 + j]
+                )
+    return found
+
+
+@njit(cache=True)
+def _is_carried(F, T, s, b, o, p0, p1, p2, radius, box, law, slip):
+    """Contact of a sphere of body b, at p, with a box of body o."""
+    if _is_apart(p0, p1, p2, radius, box):
+        return
+    gap, n0, n1, n2 = _gap(p0, p1, p2, radius, box)
+    if gap >= 0.0:
+        return
+    reach = radius + (1.0 - law[4]) * gap
+    p0, p1, p2 = p0 - reach * n0, p1 - reach * n1, p2 - reach * n2
+    a0, a1, a2 = p0 - s[b, 4], p1 - s[b, 5], p2 - s[b, 6]
+    b0, b1, b2 = p0 - s[o, 4], p1 - s[o, 5], p2 - s[o, 6]
+    u0 = s[b, 10] + s[b, 8] * a2 - s[b, 9] * a1
+    u1 = s[b, 11] + s[b, 9] * a0 - s[b, 7] * a2
+    u2 = s[b, 12] + s[b, 7] * a1 - s[b, 8] * a0
+    u0 -= s[o, 10] + s[o, 8] * b2 - s[o, 9] * b1
+    u1 -= s[o, 11] + s[o, 9] * b0 - s[o, 7] * b2
+    u2 -= s[o, 12] + s[o, 7] * b1 - s[o, 8] * b0
+    un = u0 * n0 + u1 * n1 + u2 * n2
+    fn = _normal_force(law[0], law[1], law[5], -gap, un)
+    if fn <= 0.0:
+        return
+    u0, u1, u2, speed = _slip(u0, u1, u2, un, n0, n1, n2)
+    share = 0.0
+    if speed > 1e-14:
+        share = _friction(speed, slip, law[2], law[3]) * fn / speed
+    f0, f1, f2 = fn * n0 - share * u0, fn * n1 - share * u1, fn * n2 - share * u2
+    _push(F, T, b, a0, a1, a2, f0, f1, f2)
+    _push(F, T, o, b0, b1, b2, -f0, -f1, -f2)
+
+
+@njit(cache=True)
 def _rate(t, s, mass, com, inertia, inverse, gravity, spheres, owner, fixed, pairs,
-          levers, rims, mutual, forces, drag, slip, fade, patches, dx):  # fmt: skip
+          levers, rims, mutual, boxes, carried, forces, drag, slip, fade, patches,
+          dx):  # fmt: skip
     """State s (n_bodies, 13): quaternion (4), centre of mass (3), w in world (3), its
     velocity (3)."""
     N = len(mass)
@@ -343,6 +414,7 @@ def _rate(t, s, mass, com, inertia, inverse, gravity, spheres, owner, fixed, pai
         for i in range(3):
             T[b, i] = -drag[b, 1] * s[b, 7 + i]
         _push(F, T, b, o[b, 0], o[b, 1], o[b, 2], f[b, 0], f[b, 1], f[b, 2])
+    moving = _in_world(s, turned, com, boxes)
     c = np.empty((len(spheres), 3))
     axis = np.empty(3)
     b, R = -1, turned[0]
@@ -423,6 +495,10 @@ def _rate(t, s, mass, com, inertia, inverse, gravity, spheres, owner, fixed, pai
                 T[b, 0] -= levers[j, m] * fn / turn * t0
                 T[b, 1] -= levers[j, m] * fn / turn * t1
                 T[b, 2] -= levers[j, m] * fn / turn * t2
+        for k in range(len(boxes)):
+            if carried[j, k, 0] > 0.0:
+                _is_carried(F, T, s, b, int(boxes[k, 15]), c[j, 0], c[j, 1], c[j, 2],
+                            radius, moving[k], carried[j, k], slip)  # fmt: skip
         for i in range(j):
             if owner[i] == b:  # So are all that follow.
                 break
@@ -464,8 +540,8 @@ def _rate(t, s, mass, com, inertia, inverse, gravity, spheres, owner, fixed, pai
 
 @njit(cache=True)
 def _run(start, times, mass, com, inertia, inverse, gravity, spheres, owner, fixed,
-         pairs, levers, rims, mutual, forces, drag, slip, fade, patches, max_step,
-         tol):  # fmt: skip
+         pairs, levers, rims, mutual, boxes, carried, forces, drag, slip, fade, patches,
+         max_step, tol):  # fmt: skip
     n, N = len(times), len(mass)
     out = np.full((n, N, 13), np.nan)
     s = start.copy()
@@ -482,7 +558,8 @@ def _run(start, times, mass, com, inertia, inverse, gravity, spheres, owner, fix
     k3, k4 = np.empty((N, 13)), np.empty((N, 13))
     t, h, steps = times[0], 1e-4, 0
     _rate(t, s, mass, com, inertia, inverse, gravity, spheres, owner, fixed, pairs,
-          levers, rims, mutual, forces, drag, slip, fade, patches, k1)  # fmt: skip
+          levers, rims, mutual, boxes, carried, forces, drag, slip, fade, patches,
+          k1)  # fmt: skip
     for i in range(n):
         while t < times[i] - 1e-12:
             steps += 1
@@ -491,15 +568,15 @@ def _run(start, times, mass, com, inertia, inverse, gravity, spheres, owner, fix
             h = min(h, max_step)
             step = min(h, times[i] - t)
             _rate(t + 0.5 * step, s + 0.5 * step * k1, mass, com, inertia, inverse,
-                  gravity, spheres, owner, fixed, pairs, levers, rims, mutual, forces,
-                  drag, slip, fade, patches, k2)  # fmt: skip
+                  gravity, spheres, owner, fixed, pairs, levers, rims, mutual, boxes,
+                  carried, forces, drag, slip, fade, patches, k2)  # fmt: skip
             _rate(t + 0.75 * step, s + 0.75 * step * k2, mass, com, inertia, inverse,
-                  gravity, spheres, owner, fixed, pairs, levers, rims, mutual, forces,
-                  drag, slip, fade, patches, k3)  # fmt: skip
+                  gravity, spheres, owner, fixed, pairs, levers, rims, mutual, boxes,
+                  carried, forces, drag, slip, fade, patches, k3)  # fmt: skip
             new = s + step * (2.0 / 9.0 * k1 + 1.0 / 3.0 * k2 + 4.0 / 9.0 * k3)
             _rate(t + step, new, mass, com, inertia, inverse, gravity, spheres, owner,
-                  fixed, pairs, levers, rims, mutual, forces, drag, slip, fade, patches,
-                  k4)  # fmt: skip
+                  fixed, pairs, levers, rims, mutual, boxes, carried, forces, drag,
+                  slip, fade, patches, k4)  # fmt: skip
             worst = 0.0
             for b in range(N):
                 for j in range(13):

@@ -89,7 +89,10 @@ def contact_candidates(
     """
     found: list[Candidate] = []
     for kind in KINDS:
-        for at in model.dynamics.places(kind):
+        for place in model.dynamics.places(kind):
+            at = model.by_rider(place) if isinstance(model, FreeBodyModel) else place
+            if isinstance(model, FreeBodyModel) and at in model.never_met:
+                continue
             if kind == "length_scale" and at == "world":
                 continue
             if kind in _OF_BODIES and at not in model.bodies:

@@ -114,6 +114,19 @@ class FreeBodyScene:
         return list(self._grounds)
 
     @property
+    def is_box(self) -> bool:
+        """Whether one box is all that it touches with."""
+        roles = self._numbers.role
+        return len(self._numbers.boxes) == 1 and bool(
+            np.isin(roles, (CORNER, WITHIN)).all()
+        )
+
+    @property
+    def box(self) -> np.ndarray:
+        """(15,) its box, as fixed shapes are given, in its frame."""
+        return self._numbers.boxes[0]
+
+    @property
     def has_faces(self) -> bool:
         """Whether spheres stand in for its shapes."""
         return bool((self._numbers.role != SPHERE).any())
@@ -125,10 +138,14 @@ class FreeBodyScene:
         Args: on (m,): on which of the fixed shapes; none: on all.
         """
         faces = np.isin(self._numbers.role, (CORNER, WITHIN))
-        k = self.body().pairs[faces, :, 0].sum(axis=0)
-        weight = float(self._numbers.mass) * float(np.linalg.norm(self._gravity))
-        eased = np.minimum(1.0, weight / REST_DEPTH / np.maximum(0.5 * k, 1e-9))
+        eased = self.eased(self.body().pairs[faces, :, 0].sum(axis=0))
         self._eased = eased if on is None else np.where(on, eased, 1.0)
+
+    def eased(self, stiffness):
+        """How much less stiff all of its faces together, or each of them (m,), need be
+        to carry it."""
+        weight = float(self._numbers.mass) * float(np.linalg.norm(self._gravity))
+        return np.minimum(1.0, weight / REST_DEPTH / np.maximum(0.5 * stiffness, 1e-9))
 
     def body(
         self, effects: Sequence[Effect] = (), at_corners: float = AT_CORNERS
@@ -166,10 +183,7 @@ class FreeBodyScene:
 
     def body_of(self, now: "Numbers", at_corners: float = AT_CORNERS) -> FreeBody:
         pairs = _pairs(now, self._drake) * self._touch[:, :, None]
-        # Spring and damper of what stands within a face, whose corners have the pair's.
-        inner = now.role == WITHIN
-        pairs[inner, :, 0] *= now.inner * (1.0 / at_corners - 1.0)
-        pairs[inner, :, 5] *= now.inner * (1.0 / at_corners - 1.0)
+        pairs[..., [0, 5]] *= shares(now, at_corners)[:, None, None]
         pairs[now.role != SPHERE, :, 0] *= self._eased
         return FreeBody(
             float(now.mass), now.com, now.inertia, self._gravity, now.spheres,
@@ -185,9 +199,12 @@ class FreeBodyScene:
             raise DoesNotFit(f"{self.name} has nothing to touch with")
         self.axes: list[np.ndarray] = []  # Of its cylinders, in the body's frame.
         spheres, rims, role, of = [], [], list[int](), list[int]()
-        inner = 0.0
+        inner, boxes = 0.0, []
         for i, g in enumerate(mine):
             shape, X = inspector.GetShape(g), inspector.GetPoseInFrame(g)
+            if isinstance(shape, Box):
+                half = shape.size() / 2.0
+                boxes.append([*X.rotation().matrix().ravel(), *X.translation(), *half])
             if isinstance(shape, Sphere):
                 each = [(SPHERE, [0.0, 0.0, 0.0, shape.radius()])]
             elif isinstance(shape, Capsule):
@@ -258,7 +275,7 @@ class FreeBodyScene:
             np.array([_surface(inspector, g) for g in others]).reshape(-1, 4),
             np.zeros(len(others)), np.zeros((0, 6)), np.zeros(2), np.zeros((0, 6)),
             np.full(len(others), np.nan), np.array(role), np.array(inner),
-            np.array(rims),
+            np.array(rims), np.array(boxes).reshape(-1, 15),
         )  # fmt: skip
         for effect in loaded.effects:
             if effect.kind in FORCES:
@@ -274,7 +291,8 @@ class Numbers:
     """What effects change. own (n, 4), other (m, 4): stiffness (inf: Drake's guess),
     dissipation, static and dynamic friction of each surface; rolling (m,); damper (m,):
     in the place of the dissipation, NaN where there is none; role (n,) of each sphere;
-    inner: corners of a face for each sphere within it; rims (n, 5) as of FreeBody."""
+    inner: corners of a face for each sphere within it; rims (n, 5) as of FreeBody;
+    boxes (k, 15): of the body, as fixed shapes are given, in its frame."""
 
     mass: np.ndarray
     com: np.ndarray
@@ -292,6 +310,14 @@ class Numbers:
     role: np.ndarray
     inner: np.ndarray
     rims: np.ndarray
+    boxes: np.ndarray
+
+
+def shares(now: Numbers, at_corners: float) -> np.ndarray:
+    """(n,) of the pair's spring and damper that each sphere has: a corner all of it,
+    what stands within a face so much that its corners carry their share."""
+    within = now.inner * (1.0 / at_corners - 1.0)
+    return np.where(now.role == WITHIN, within, 1.0)
 
 
 def gone_on(fixed: np.ndarray) -> np.ndarray:
@@ -398,6 +424,7 @@ def _size(now: Numbers, p, on) -> None:
     scale = p["scale"] if "scale" in p else p["radius"] / now.spheres[0, 3]
     now.spheres *= scale
     now.rims[:, 3] *= scale
+    now.boxes[:, 9:] *= scale
     now.com *= scale
     now.inertia *= scale**2
 
