@@ -7,9 +7,11 @@ import pytest
 from test_gap_forward import Columns, directions
 
 from makebreak.gap.fit import fit_effects
+from makebreak.gap.problem import Outcome
 from makebreak.gap.result import GapMeasure, RivalSet
 from makebreak.gap.search import drop
 from makebreak.gap.search.choice import Choice, Selection
+from makebreak.gap.search.chosen_by_simulation import preferred_by_simulation
 from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.search.rivals import still_tied, with_rivals_of_pairs
 from makebreak.gap.search.select import select
@@ -138,3 +140,33 @@ def test_what_leaves_more_is_no_tie_of_what_is_left_of_two():
     mass = Effect(MASS[0], [MASS[1]], {"mass": 0.1})
     left = replace(chosen(*GAIN, bias=4.0), paired=True, ties=(mass,))
     assert still_tied(search, [left], fitted, 0) == ()
+
+
+@pytest.mark.parametrize(
+    ("here", "there", "named", "tied"),
+    [
+        (3.6, 2.1, "instead", False), (1.4, 0.5, "as before", True),
+        (1.4, 2.1, "as before", False), (3.6, 3.1, "as before", True),
+    ],
+)  # fmt: skip
+def test_simulated_windows_decide_between_two_and_two(
+    monkeypatch, here, there, named, tied
+):
+    """A tool that was dragged: two frictions, or half of a drive's force and a lighter
+    sled, do the same but where it sets out."""
+    it = problem(4.0)
+    selection = select(it)
+    was = {c.effect.kind for c in selection.choices}
+
+    def outcome(effects, *of, jobs=1):
+        left = here if {e.kind for e in effects} == was else there
+        return Outcome(GapMeasure(20.0, left, 1.0, 0.6))
+
+    monkeypatch.setattr(it, "outcome", outcome)
+    monkeypatch.setattr(it, "plan", replace(it.plan, simulation_agrees=True))
+    before = outcome(selection.effects())
+    after, _ = preferred_by_simulation(it, selection, before, 1)
+    now = {c.effect.kind for c in after.choices}
+    assert (now != was) == (named == "instead") and len(now) == 2
+    assert any(c.sets for c in after.choices) == tied
+    assert all(c.std and abs(c.margin) < 0.05 for c in after.choices if now != was)
