@@ -439,6 +439,33 @@ def test_rolling_resistance_slows_evenly(tmp_path, time_step):
     np.testing.assert_allclose(slowing, 5 / 7 * c * G, rtol=1e-2)
 
 
+def test_rolling_resistance_slows_a_soft_ball_as_evenly(tmp_path):
+    """Its contact is a surface, and no point."""
+    ground = on_ground(tmp_path, "ball", 0.0005)
+    ground = replace(ground, plant=replace(ground.plant, contact_model="hydroelastic"))
+    soft = (
+        "<drake:compliant_hydroelastic/>"
+        "<drake:hydroelastic_modulus>1e7</drake:hydroelastic_modulus>"
+        "<drake:mesh_resolution_hint>0.005</drake:mesh_resolution_hint>"
+    )
+    for file in tmp_path.glob("*.sdf"):
+        opening = "<drake:proximity_properties>"
+        file.write_text(file.read_text().replace(opening, opening + soft))
+        assert soft in file.read_text()
+    start = at_rest_but(
+        body="b.ball", pose=[1, 0, 0, 0, 0, 0, RADIUS - 2e-4],
+        twist=[0, 0.5 / RADIUS, 0, 0.5, 0, 0],
+    )  # fmt: skip
+    slowing = []
+    for c in (0.0, 0.02):
+        scene = with_effects(ground, ("rolling_resistance", PAIR, dict(coefficient=c)))
+        times = np.array([0.0, 0.05, 0.35])
+        rows = SceneSimulation(scene).run(start, times, ["b.ball.vx"])
+        slowing.append((rows[1, 0] - rows[2, 0]) / 0.3)
+    # A polyhedron with edges of 5 mm is no perfect ball: it is slowed all the same.
+    np.testing.assert_allclose(slowing[1] - slowing[0], 5 / 7 * 0.02 * G, rtol=0.1)
+
+
 @pytest.mark.parametrize("c", [0.0, 0.02])
 def test_a_lying_cylinder_rolls_against_a_resistance(tmp_path, c):
     scene = with_effects(

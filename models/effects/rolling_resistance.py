@@ -46,6 +46,10 @@ class RollingResistance(LeafSystem):
         super().__init__()
         self._lever = coefficient * radius
         self._pair = (int(ball.index()), int(other.index()))
+        ours, theirs = (
+            set(plant.GetCollisionGeometriesForBody(body)) for body in (ball, other)
+        )
+        self._geometries = (ours, theirs)
         # Start of each body's angular velocity (and torque) in v, in world axes; -1
         # for an anchored body, which has none.
         self._at = np.array(
@@ -92,6 +96,27 @@ class RollingResistance(LeafSystem):
                     self._n_q,
                     FADE_RATE,
                 )
+        for i in range(results.num_hydroelastic_contacts()):
+            contact = results.hydroelastic_contact_info(i)
+            surface = contact.contact_surface()
+            of = surface.id_M(), surface.id_N()
+            ours, theirs = self._geometries
+            if not any(a in ours and b in theirs for a, b in (of, of[::-1])):
+                continue
+            normal = sum(
+                surface.area(k) * surface.face_normal(k)
+                for k in range(surface.num_faces())
+            )
+            generalized = rolling_torque(
+                generalized,
+                self._x.Eval(context),
+                contact.F_Ac_W().translational(),
+                normal / np.linalg.norm(normal),
+                self._lever,
+                self._at,
+                self._n_q,
+                FADE_RATE,
+            )
         discrete_state.set_value(self._force, generalized)
 
 
