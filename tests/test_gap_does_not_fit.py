@@ -21,7 +21,7 @@ def with_problems(monkeypatch, first_that_fits, order, error=DoesNotFit):
     fits = order.index(first_that_fits)
     for k, name in enumerate(order):
 
-        def make(scene, recordings, k=k, name=name):
+        def make(scene, recordings, k=k, name=name, **_):
             if k < fits:
                 raise (error if k == fits - 1 else DoesNotFit)("setting an element")
             return SimpleNamespace(
@@ -37,7 +37,7 @@ def with_problems(monkeypatch, first_that_fits, order, error=DoesNotFit):
     monkeypatch.setattr(workflow, "one_dof_joints", lambda plant: [joint])
     monkeypatch.setattr(workflow, "without_contact", lambda *_: ([], []))
     monkeypatch.setattr(workflow, "_settle_step", lambda scene, *_: (scene, []))
-    for name in ("sap_lift", "point_on_face", "point_on_face_of"):
+    for name in ("sap_lift", "point_on_face", "point_on_face_of", "smooth_surface_of"):
         monkeypatch.setattr(workflow, name, lambda *_: [])
     return workflow.problem_for(None, [], SimpleNamespace(plant=None))
 

@@ -59,8 +59,8 @@ def check_meshes(loaded: LoadedScene, recordings: Sequence[Recording]) -> None:
                     raise ValueError(
                         f"{name} was seen {np.median(depth):.3g} m inside the convex "
                         f"hull of {full_name(plant, body)}'s mesh, which is hollow "
-                        "there: point contact takes the hull. Make it of boxes or of "
-                        "convex pieces, a collision each"
+                        "there: point contact takes the hull. Use hydroelastic "
+                        "contact, or make it of boxes, a collision each"
                     )
 
 

@@ -25,6 +25,7 @@ from makebreak.gap.data.recording import Episode, Recording
 from makebreak.gap.report.clock import zero_of
 from makebreak.gap.result import GapResult, Series
 from makebreak.gap.simulation.commands import Commands
+from makebreak.gap.simulation.free_bodies import moved_on_smooth
 from makebreak.gap.simulation.scene_simulation import SceneSimulation
 from makebreak.models.effects.kind import full_name, one_dof_joints
 from makebreak.models.scene import (
@@ -87,7 +88,8 @@ def comparison_html(
         return None
     initial = measured_state(recording, episode, start, loaded["before"].plant)
     motions = {
-        name: _simulated(s, recording, episode, initial, times, names)
+        name: _rolled(loaded[name], initial, times)
+        or _simulated(s, recording, episode, initial, times, names)
         for name, s in scenes.items()
     }
     best = motions.get("after", motions["before"])
@@ -190,6 +192,22 @@ def _measured(
             t, value = recording.samples(name, episode)
             if len(t):
                 columns[name] = np.interp(times, t, value)
+    return Motion(times, columns)
+
+
+def _rolled(
+    loaded: LoadedScene, initial: InitialSection, times: np.ndarray
+) -> Motion | None:
+    """Of free bodies on a smooth surface that plates stand for, as they were judged:
+    Drake's knock at the edges. None: there is no such surface."""
+    poses = moved_on_smooth(loaded, initial, times)
+    if poses is None:
+        return None
+    columns = {
+        f"{name}.{c}": pose[:, k]
+        for name, pose in poses.items()
+        for k, c in enumerate((*_QUATERNION, *"xyz"))
+    }
     return Motion(times, columns)
 
 

@@ -5,7 +5,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from pydrake.geometry import Box, Capsule, Cylinder, HalfSpace, Sphere
+from numba import njit
+from pydrake.geometry import (
+    Box,
+    Capsule,
+    Cylinder,
+    HalfSpace,
+    Mesh,
+    ReadObjToTriangleSurfaceMesh,
+    Sphere,
+)
 from pydrake.math import RollPitchYaw
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, RigidBody
@@ -13,6 +22,13 @@ from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.numerics.free_body import EDGE, FACE, FreeBody
+from makebreak.gap.numerics.smooth_faces import (
+    MESH,
+    SmoothFaces,
+    smooth_faces,
+    smooth_mesh,
+    together,
+)
 from makebreak.gap.simulation.face_supports import (
     INNER,
     POINT,
@@ -35,6 +51,7 @@ SPHERE, CORNER, WITHIN, ROUND, ROD = range(5)
 # [m] As far a box may be above what it stands on; it goes on below a half-space.
 STANDS, BELOW = 1e-3, 1.0
 REST_DEPTH = 2e-5  # [m] Of a body on a face that is not stiffer than it need be.
+RIGID = 1e12  # [N/m]
 AT_CORNERS = 0.4  # Of a face's load; it is 0.16 (a disc's rim: 0.33) if pressed evenly.
 # Forces that have their own numbers here; what changes shapes, inertias and surfaces is
 # read off the plant.
@@ -48,22 +65,62 @@ _PLANT = ("object_size", "corner_radius", "object_mass", "object_com", "object_i
           "gravity_tilt")  # fmt: skip
 
 
-def load_free_bodies(scene: Scene) -> tuple[LoadedScene, list[RigidBody]]:
-    """The scene, and its free bodies.
+def load_free_bodies(
+    scene: Scene, loaded: LoadedScene | None = None
+) -> tuple[LoadedScene, list[RigidBody]]:
+    """The scene, if it is not loaded yet, and its free bodies.
 
     Raises: DoesNotFit where anything else moves, or contact is not that of points.
     """
     for effect in scene.effects:
         if effect.kind not in (*FORCES, "length_scale", *_PLANT):
             raise DoesNotFit(f"effect {effect.kind} is not one of a free body")
-    if scene.friction_zones or scene.plant.contact_model != "point":
-        raise DoesNotFit("friction zones and hydroelastic contact are Drake's alone")
-    loaded = load_scene(scene, DiagramBuilder())
+    if scene.friction_zones:
+        raise DoesNotFit("friction zones are Drake's alone")
+    loaded = loaded or load_scene(scene, DiagramBuilder())
     plant = loaded.plant
     bodies = [plant.get_body(i) for i in sorted(plant.GetFloatingBaseBodies())]
     if not bodies or plant.num_velocities() != 6 * len(bodies):
         raise DoesNotFit("expected free bodies and nothing else that moves")
+    if scene.plant.contact_model != "point" and not _rolls_on_mesh(loaded, bodies):
+        raise DoesNotFit(
+            "hydroelastic contact is Drake's alone, but of a ball on a mesh"
+        )
     return loaded, bodies
+
+
+def _rolls_on_mesh(loaded: LoadedScene, bodies: Sequence[RigidBody]) -> bool:
+    """Whether one soft ball is all that moves, and what is fixed is rigid meshes."""
+    plant, inspector = loaded.plant, loaded.scene_graph.model_inspector()
+
+    def all_are(body: RigidBody, kind, compliance: str) -> bool:
+        return all(
+            isinstance(inspector.GetShape(g), kind)
+            and _compliance(inspector, g) == compliance
+            for g in plant.GetCollisionGeometriesForBody(body)
+        )
+
+    fixed = [
+        body for k in range(plant.num_bodies())
+        if plant.IsAnchored(body := plant.get_body(BodyIndex(k)))
+        and plant.GetCollisionGeometriesForBody(body)
+    ]  # fmt: skip
+    return (
+        len(bodies) == 1
+        and len(plant.GetCollisionGeometriesForBody(bodies[0])) == 1
+        and all_are(bodies[0], Sphere, "compliant")
+        and bool(fixed)
+        and all(all_are(body, Mesh, "rigid") for body in fixed)
+    )
+
+
+def _compliance(inspector, geometry) -> str:
+    """ "": it is not hydroelastic. (What kind it is Drake does not tell Python.)"""
+    properties = inspector.GetProximityProperties(geometry)
+    if not properties.HasProperty("hydroelastic", "compliance_type"):
+        return ""
+    is_soft = properties.HasProperty("hydroelastic", "hydroelastic_modulus")
+    return "compliant" if is_soft else "rigid"
 
 
 def in_order(effects: Sequence[Effect]) -> list[Effect]:
@@ -183,6 +240,8 @@ class FreeBodyScene:
 
     def body_of(self, now: "Numbers", at_corners: float = AT_CORNERS) -> FreeBody:
         pairs = _pairs(now, self._drake) * self._touch[:, :, None]
+        if self._soft:  # No stiffness of point contacts changes it.
+            pairs[:, :, 0] = self._soft * self._touch
         pairs[..., [0, 5]] *= shares(now, at_corners)[:, None, None]
         pairs[now.role != SPHERE, :, 0] *= self._eased
         return FreeBody(
@@ -190,7 +249,15 @@ class FreeBodyScene:
             now.fixed, pairs,
             now.rolling[None, :] * now.spheres[:, 3:], now.forces, now.drag,
             fade=FADE_RATE, patches=now.patches, rims=now.rims,
+            smooth=self.smooth,
         )  # fmt: skip
+
+    def _softness(self, inspector, geometry) -> float:
+        """[N/m] of a hydroelastic ball: on something flat and rigid it gives pi E d^2
+        at a depth d, which is taken for the spring that is as deep under its weight."""
+        properties = inspector.GetProximityProperties(geometry)
+        modulus = properties.GetProperty("hydroelastic", "hydroelastic_modulus")
+        return float(np.sqrt(np.pi * modulus * self._weight))
 
     def _read(self, loaded: LoadedScene, body: RigidBody) -> None:
         plant, inspector = loaded.plant, loaded.scene_graph.model_inspector()
@@ -234,7 +301,9 @@ class FreeBodyScene:
                 role.append(what)
                 of.append(i)
         context = plant.CreateDefaultContext()
-        fixed, others, origins = [], [], []
+        fixed: list[list[float]] = []
+        others, origins = [], []
+        meshes: list[SmoothFaces] = []
         self._grounds: list[str] = []
         self._whole_name = {self.name.split(".")[0]: self.name}
         for i in range(plant.num_bodies()):
@@ -249,6 +318,9 @@ class FreeBodyScene:
                     half = shape.size() / 2.0
                 elif isinstance(shape, HalfSpace):
                     half = np.array([-1.0, 0.0, 0.0])
+                elif isinstance(shape, Mesh) and _compliance(inspector, g):
+                    half = np.array([MESH, 0.0, 0.0])
+                    meshes.append(smooth_mesh(*_surface_of(shape), len(fixed)))
                 else:
                     raise DoesNotFit(f"a {type(shape).__name__} that is fixed")
                 fixed.append([*X.rotation().matrix().ravel(), *X.translation(), *half])
@@ -257,22 +329,31 @@ class FreeBodyScene:
                 name = full_name(plant, ground)
                 self._grounds.append(name)
                 self._whole_name[name.split(".")[0]] = name
+        solid = gone_on(np.array(fixed).reshape(-1, 15))
+        plates = smooth_faces(solid, self._grounds)
+        self.smooth = together([plates, *meshes], len(solid))
         M = body.default_spatial_inertia()
         mass, com = M.get_mass(), np.array(M.get_com())
         about = M.CalcRotationalInertia().CopyToFullMatrix3()
         central = about - mass * (com @ com * np.eye(3) - np.outer(com, com))
         self._gravity = np.array(plant.gravity_field().gravity_vector())
+        self._weight = mass * float(np.linalg.norm(self._gravity))
         self._drake = drakes(plant)
+        own = np.array([_surface(inspector, g) for g in mine])
+        other = np.array([_surface(inspector, g) for g in others]).reshape(-1, 4)
+        # Of a soft ball on a rigid mesh: its depth is that of the weight.
+        self._soft = self._softness(inspector, mine[0]) if meshes else 0.0
+        if self._soft:
+            own[:, 0], other[:, 0] = self._soft, RIGID
         self._touch = np.array(
             [[not inspector.CollisionFiltered(a, b) for b in others] for a in mine],
             float,
         ).reshape(len(mine), len(others))[of]
         self._numbers = Numbers(
             np.array(mass), com, central, np.array(spheres),
-            gone_on(np.array(fixed).reshape(-1, 15)),
+            solid,
             np.array(origins).reshape(-1, 3),
-            np.array([_surface(inspector, g) for g in mine])[of],
-            np.array([_surface(inspector, g) for g in others]).reshape(-1, 4),
+            own[of], other,
             np.zeros(len(others)), np.zeros((0, 6)), np.zeros(2), np.zeros((0, 6)),
             np.full(len(others), np.nan), np.array(role), np.array(inner),
             np.array(rims), np.array(boxes).reshape(-1, 15),
@@ -328,39 +409,69 @@ def gone_on(fixed: np.ndarray) -> np.ndarray:
     be the nearest to a corner that is a little deep, and would push it down.
     """
     out = np.array(fixed)
-    signs = np.array(list(itertools.product((-1.0, 1.0), repeat=2)))
     for i, box in enumerate(fixed):
-        R, half = box[:9].reshape(3, 3), box[12:]
-        if half[0] < 0.0:  # A half-space.
+        if box[12] < 0.0:  # A half-space.
             continue
         for axis, side in itertools.product(range(3), (-1.0, 1.0)):
-            corners = np.empty((4, 3))
-            corners[:, axis] = side * half[axis]
-            across = [k for k in range(3) if k != axis]
-            corners[:, across] = signs * half[across]
-            out_of = side * R[:, axis]
-            foot = box[9:12] + corners @ R.T
-            deep = max(
-                _on_the_way_out(other, foot, out_of)
-                for k, other in enumerate(fixed) if k != i
-            ) if len(fixed) > 1 else 0.0  # fmt: skip
-            out[i, 9:12] += 0.5 * deep * out_of
+            deep = _on_the_way_out(fixed, i, axis, side)
+            out[i, 9:12] += 0.5 * deep * side * box[:9].reshape(3, 3)[:, axis]
             out[i, 12 + axis] += 0.5 * deep
     return out
 
 
-def _on_the_way_out(shape, points, way) -> float:
-    """How far all points (n, 3) can go along a way (3,) within a fixed shape; 0 if one
-    of them is more than STANDS above it."""
-    R = shape[:9].reshape(3, 3)
-    a, d = (points + STANDS * way - shape[9:12]) @ R, way @ R
-    if shape[12] < 0.0:
-        return BELOW if (a[:, 2] <= 0.0).all() and d[2] < -1e-9 else 0.0
-    if (np.abs(a) > shape[12:] + 1e-9).any():
-        return 0.0
-    steep = np.abs(d) > 1e-9
-    left = (shape[12:] - np.sign(d) * a)[:, steep] / np.abs(d[steep])
-    return STANDS + float(left.min())
+@njit(cache=True)
+def _on_the_way_out(fixed, i, axis, side):
+    """How far all corners of a face of box i can go along its normal within another
+    fixed shape, at most; 0 if one of them is more than STANDS above it."""
+    box, most = fixed[i], 0.0
+    u, v = (axis + 1) % 3, (axis + 2) % 3
+    for m in range(len(fixed)):
+        if m == i:
+            continue
+        shape, left, inside = fixed[m], np.inf, True
+        for corner in range(4):
+            s = 1.0 if corner % 2 else -1.0
+            t = 1.0 if corner // 2 else -1.0
+            for k in range(3):  # In the axes of the shape.
+                a = d = 0.0
+                for x in range(3):
+                    way = side * box[3 * x + axis]
+                    at = (
+                        box[9 + x] + way * (box[12 + axis] + STANDS)
+                        + s * box[12 + u] * box[3 * x + u]
+                        + t * box[12 + v] * box[3 * x + v]
+                    )  # fmt: skip
+                    a += shape[3 * x + k] * (at - shape[9 + x])
+                    d += shape[3 * x + k] * way
+                if shape[12] == MESH:
+                    inside = False
+                elif shape[12] < 0.0:
+                    if k == 2 and (a > 0.0 or d >= -1e-9):
+                        inside = False
+                elif abs(a) > shape[12 + k] + 1e-9:
+                    inside = False
+                elif abs(d) > 1e-9:
+                    left = min(left, (shape[12 + k] - np.sign(d) * a) / abs(d))
+            if not inside:
+                break
+        if inside:
+            most = max(most, BELOW if shape[12] < 0.0 else STANDS + left)
+    return most
+
+
+def _surface_of(shape: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) and triangles (T, 3) of a mesh.
+
+    Raises: DoesNotFit of a file that is no OBJ.
+    """
+    if not shape.source().is_path() or shape.extension() != ".obj":
+        raise DoesNotFit("a fixed mesh that is no .obj file")
+    mesh = ReadObjToTriangleSurfaceMesh(str(shape.source().path()))
+    vertices = np.array([mesh.vertex(i) for i in range(mesh.num_vertices())])
+    faces = [mesh.element(i) for i in range(mesh.num_triangles())]
+    triangles = np.array([[f.vertex(k) for k in range(3)] for f in faces])
+    scale = np.ravel(shape.scale3())
+    return vertices * scale, triangles[:, :: int(np.sign(scale.prod()))]
 
 
 def _surface(inspector, geometry) -> list[float]:

@@ -9,6 +9,7 @@ MuJoCo, and for the bowl an ODE: no contact law is the one of the scene.
 
 import argparse
 import json
+import re
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,6 +17,7 @@ from pathlib import Path
 
 import numba
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 if __name__ == "__main__":  # The package is found beside the tests.
     sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
@@ -30,6 +32,7 @@ from gap_benchmark.contact_cases import (
     tip_robot,
 )
 from gap_benchmark.contact_scenes import (
+    MODULUS,
     Episode,
     Sensing,
     Setting,
@@ -40,6 +43,7 @@ from gap_benchmark.contact_scenes import (
     pair,
     pair_friction,
     record,
+    to_sdf,
     write_scene,
 )
 from gap_benchmark.robots import Body, Robot
@@ -302,18 +306,16 @@ def hidden(s: Setting, name: str, rng) -> tuple[Setting, list[dict]]:
 
 
 @numba.njit(cache=True)
-def _rolls(s, t0, times, R, r, m, k, d, mu, rolling, out):
-    """State: centre p (3), v (3), w (3) in world, q (4). The bowl's centre is at z = R.
-    Semi-implicit steps of 10 us."""
+def _rolls(s, t0, times, middle, g, R, r, m, k, d, mu, rolling, out):
+    """State: centre p (3), v (3), w (3) in world, q (4). middle (3,): of the bowl, a
+    sphere of radius R; g (3,): gravity. Semi-implicit steps of 10 us."""
     h, t, inertia = 1e-5, t0, 0.4 * m * r * r
     for i in range(len(times)):
         while t < times[i] - 0.5 * h:
-            c = s[:3].copy()
-            c[2] -= R
+            c = s[:3] - middle
             far = np.sqrt(c @ c)
             n = -c / far
-            f, torque = np.zeros(3), np.zeros(3)
-            f[2] = -9.81 * m
+            f, torque = m * g, np.zeros(3)
             depth = far + r - R
             if depth > 0.0:
                 v, w = s[3:6], s[6:9]
@@ -358,8 +360,58 @@ def bowl_of_plates(R: float, mu: float, degrees: float) -> Thing:
     return Thing("bowl", tuple(plates))
 
 
-def write_bowl(name: str, rng, folder: Path, hz: float, degrees: float = 8.0):
-    """A ball that rolls to and fro. name: what is hidden, or ""."""
+def bowl_mesh(R: float, degrees: float) -> str:
+    """The same as a shell, 5 mm thick, as text of a Wavefront file."""
+    rings = round(70.0 / degrees)
+    around = 2 * round(180.0 / degrees)
+    lines, faces = [], []
+    for r in (R, R + 0.005):
+        lines.append(f"v 0 0 {R - r!r}")
+        for theta in np.radians(70.0) * np.arange(1, rings + 1) / rings:
+            for phi in 2 * np.pi * np.arange(around) / around:
+                x, y = np.cos(phi), np.sin(phi)
+                s, c = r * np.sin(theta), R - r * np.cos(theta)
+                lines.append(f"v {float(s * x)!r} {float(s * y)!r} {float(c)!r}")
+
+    def at(side: int, ring: int, k: int) -> int:
+        first = 1 + side * (1 + rings * around)
+        return first + (ring > 0) * (1 + (ring - 1) * around + k % around)
+
+    for k in range(around):
+        for ring in range(rings):
+            for side in (0, 1):
+                a, b = at(side, ring, k), at(side, ring, k + 1)
+                c, d = at(side, ring + 1, k), at(side, ring + 1, k + 1)
+                each = [(a, c, d), (a, d, b)] if ring else [(a, c, d)]
+                faces += [f[:: -1 if side else 1] for f in each]
+        a, b = at(0, rings, k), at(0, rings, k + 1)
+        c, d = at(1, rings, k), at(1, rings, k + 1)
+        faces += [(a, c, d), (a, d, b)]
+    return "\n".join([*lines, *(f"f {a} {b} {c}" for a, b, c in faces)]) + "\n"
+
+
+def with_mesh(folder: Path, s: Setting, mesh: str) -> None:
+    """Writes the bowl of a scene's folder as a rigid mesh, and the ball as soft."""
+    bowl, one = s.thing("bowl"), s.free[0]
+    text = to_sdf(replace(bowl, shapes=bowl.shapes[:1]), s, compliant=True)
+    shape = r"<pose>[^<]*</pose><geometry>.*</geometry>"
+    text = re.sub(shape, "<geometry><mesh><uri>bowl.obj</uri></mesh></geometry>", text)
+    (folder / "bowl.obj").write_text(mesh)
+    (folder / "bowl.sdf").write_text(text)
+    # As deep under its weight as in its world.
+    modulus = s.stiffness**2 / (np.pi * one.mass * G)
+    soft = to_sdf(one, s, compliant=True).replace(f">{MODULUS}<", f">{modulus!r}<")
+    (folder / f"{one.name}.sdf").write_text(soft)
+    scene = folder / "scene.yaml"
+    point, soft = "contact_model: point", "contact_model: hydroelastic"
+    scene.write_text(scene.read_text().replace(point, soft))
+
+
+def write_bowl(
+    name: str, rng, folder: Path, hz: float, degrees: float = 8.0, is_mesh: bool = False
+):
+    """A ball that rolls to and fro. name: what is hidden, or ""; degrees: between the
+    plates, or the triangles, that model the bowl."""
     R = r_bowl = float(rng.uniform(0.15, 0.25))
     one = round_ball(rng)
     r, mu = float(rng.uniform(0.015, 0.025)), float(rng.uniform(0.3, 0.5))
@@ -368,6 +420,7 @@ def write_bowl(name: str, rng, folder: Path, hz: float, degrees: float = 8.0):
                   inertia=(0.4 * m * r * r,) * 3)  # fmt: skip
     s = Setting((bowl_of_plates(R, mu, degrees), one), stiffness=2e4)
     mu_true, r_true, rolling, effects = mu, r, 0.0, []
+    moved, g, slips = np.zeros(3), np.array([0.0, 0.0, -G]), 0.0
     at = f"{one.body}~bowl.bowl"
     up = rng.choice([-1.0, 1.0])
     if name == "rolling":
@@ -382,6 +435,23 @@ def write_bowl(name: str, rng, folder: Path, hz: float, degrees: float = 8.0):
         r_bowl = R * (1.0 + float(up * rng.uniform(0.08, 0.15)))
         effects = [{"kind": "(outside the catalogue)", "at": "bowl.bowl",
                     "parameters": {"radius": r_bowl}}]  # fmt: skip
+    elif name == "friction":  # It shows while the ball slides.
+        slips = 1.0
+        mu_true = mu * float(rng.uniform(0.5, 0.7) if up < 0 else rng.uniform(1.4, 1.8))
+        effects = [{"kind": "contact_friction", "at": at,
+                    "parameters": {"friction": mu_true}}]  # fmt: skip
+    elif name == "place":
+        moved[:2] = rng.uniform(0.004, 0.01, 2) * rng.choice([-1.0, 1.0], 2)
+        x, y, _ = moved.tolist()
+        effects = [{"kind": "wall_position", "at": "bowl.bowl",
+                    "parameters": {"x": x, "y": y}}]  # fmt: skip
+    elif name == "tilt":
+        roll, pitch = rng.uniform(0.01, 0.03, 2) * rng.choice([-1.0, 1.0], 2)
+        # The scene turned so, seen in its own axes.
+        turn = Rotation.from_euler("xyz", [roll, pitch, 0.0])
+        g = turn.inv().apply(g)
+        effects = [{"kind": "gravity_tilt", "at": "world",
+                    "parameters": {"roll": roll, "pitch": pitch}}]  # fmt: skip
     elif name:
         raise ValueError(f"no law for {name}")
     sense = Sensing(camera_hz=hz, wrench=None)
@@ -392,20 +462,34 @@ def write_bowl(name: str, rng, folder: Path, hz: float, degrees: float = 8.0):
         theta, phi = rng.uniform(0.5, 0.8), rng.uniform(-np.pi, np.pi)
         way = np.array([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi),
                         -np.cos(theta)])  # fmt: skip
-        p = (r_bowl - r_true) * way + [0.0, 0.0, r_bowl]
+        middle = moved + [0.0, 0.0, R]
+        p = (r_bowl - r_true) * way + middle
         aside = rng.uniform(-0.3, 0.3)
         v = aside * np.array([-np.sin(phi), np.cos(phi), 0.0])
         w = np.cross(-way, v) / r_true
+        if slips:
+            w += (
+                slips
+                * rng.uniform(0.5, 1.0)
+                * np.cross(way, rng.normal(size=3))
+                / r_true
+            )
         start = np.concatenate([p, v, w, [1.0, 0.0, 0.0, 0.0]])
         rows = np.empty((len(t), 7))
-        _rolls(start, 0.0, t, r_bowl, r_true, m, s.stiffness, 2.0, mu_true, rolling,
-               rows)  # fmt: skip
+        _rolls(start, 0.0, t, middle, g, r_bowl, r_true, m, s.stiffness, 2.0, mu_true,
+               rolling, rows)  # fmt: skip
         kept: dict[str, list] = {k: [] for k in ("q", "v", "c", "u", "f")}
         tables.append(_measured(s, t, number, kept, {one.body: rows}, sense, rng))
     columns = {k: np.concatenate([e[k] for e in tables]) for k in tables[0]}
     tolerance = {"contact_stiffness": 0.1, "contact_dissipation": 1.0}
     write_scene(folder, s, columns, _noise(s, columns, sense), 0.0005, tolerance)
+    if is_mesh:
+        with_mesh(folder, s, bowl_mesh(R, degrees))
     return effects
+
+
+# Degrees between plates; whether it is a mesh.
+BOWLS = {"bowl": (8.0, False), "bowl_fine": (2.5, False), "bowl_mesh": (4.0, True)}
 
 
 # ----- Cases
@@ -417,8 +501,8 @@ def write(
     """Writes scene and recording, of so many episodes at most. Returns: what is hidden,
     which is not in the folder."""
     rng = np.random.default_rng(seed)
-    if scene == "bowl":
-        return write_bowl(name, rng, folder, hz)
+    if scene in BOWLS:
+        return write_bowl(name, rng, folder, hz, *BOWLS[scene])
     s, episodes = SCENES[scene](rng)
     truth, effects = hidden(s, name, rng) if name else (s, [])
     sense = Sensing(hz, wrench=0.05 if wrench else None)
@@ -430,7 +514,7 @@ def write(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Writes a scene and its recording.")
-    parser.add_argument("scene", choices=[*SCENES, "bowl"])
+    parser.add_argument("scene", choices=[*SCENES, *BOWLS])
     parser.add_argument("hide", help="what is hidden, or none")
     parser.add_argument("seed", type=int)
     parser.add_argument("folder", type=Path)
