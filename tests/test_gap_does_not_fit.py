@@ -31,13 +31,15 @@ def with_problems(monkeypatch, first_that_fits, order, error=DoesNotFit):
         monkeypatch.setattr(workflow, name, make)
     for name in ("presses", "runs_against", "is_driven"):
         monkeypatch.setattr(workflow, name, lambda *_: True)
+    monkeypatch.setattr(workflow, "push_each_other", lambda *_: False)
     is_mechanism = order is OF_JOINTS
     monkeypatch.setattr(workflow, "_is_mechanism", lambda *_: is_mechanism)
     joint = SimpleNamespace(num_velocities=lambda: 1)
     monkeypatch.setattr(workflow, "one_dof_joints", lambda plant: [joint])
     monkeypatch.setattr(workflow, "without_contact", lambda *_: ([], []))
     monkeypatch.setattr(workflow, "_settle_step", lambda scene, *_: (scene, []))
-    for name in ("sap_lift", "point_on_face", "point_on_face_of", "smooth_surface_of"):
+    for name in ("sap_lift", "point_on_face", "point_on_face_of", "smooth_surface_of",
+                 "set_command_times"):  # fmt: skip
         monkeypatch.setattr(workflow, name, lambda *_: [])
     return workflow.problem_for(None, [], SimpleNamespace(plant=None))
 
