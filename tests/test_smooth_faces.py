@@ -156,8 +156,15 @@ def test_what_is_meant_as_it_is_stays_so():
     assert (surfaces_of(*tiles, ramp) == -1).all()
     # Stairs, and five plates of a pipe.
     stairs = [box([0.1 * k, 0.0, 0.005 * k], [0.05, 0.3, 0.01]) for k in range(9)]
+    far = [box([9.0 * k, 0.0, 9.0], [0.05, 0.3, 0.01]) for k in range(1, 9)]
     assert (surfaces_of(*stairs) == -1).all()
-    assert (surfaces_of(*plates(8.0, True)[:5]) == -1).all()
+    assert (surfaces_of(*plates(8.0, True)[:5], *far) == -1).all()
+    # Plates that do not meet, by more than an arc is off them.
+    bowl = plates(3.0, True)
+    assert (surfaces_of(*bowl)[:, 5] >= 0).all()
+    out = np.random.default_rng(0).uniform(-1e-3, 1e-3, len(bowl))
+    bowl[:, 9:12] += out[:, None] * bowl[:, [2, 5, 8]]
+    assert (surfaces_of(*bowl)[:, 5] >= 0).mean() < 0.7
     # One octagon, whose sides turn by 45 degrees.
     sides = []
     for angle in np.pi / 4.0 * np.arange(8):
