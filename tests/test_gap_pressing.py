@@ -236,6 +236,20 @@ def test_bodies_that_stand_elsewhere_are_felt_there(displaced):
     assert off[WALL]["x"] == pytest.approx(0.025, abs=1e-3)
 
 
+def test_places_that_were_felt_explain_recordings_that_nobody_looked_at(
+    displaced, tmp_path
+):
+    there = dict(table=-0.012, wall=0.325, mu=(0.42, 0.35))
+    unseen = record(tmp_path, **there, force=11.0, n=2)  # Pressed harder.
+    selection = select(displaced)
+    assert {c.effect.kind for c in selection.choices} >= {"plane_height"}
+    found = displaced.unseen(unseen, selection.start, selection.end)
+    assert found is not None
+    (before, after), units = found
+    assert before > 10.0 * after and after < 1.5
+    assert units["gantry.x equation"].unit == "N"
+
+
 def test_what_stands_on_something_is_displaced_with_it(displaced):
     """The wall stands on the table, nothing stands on the wall."""
     number = {name: k for k, name in displaced.shapes.names.items()}
