@@ -6,6 +6,7 @@ from itertools import product
 
 import numpy as np
 import pytest
+from push_problems import screen_of
 from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.gap.data.reading import read_recordings
@@ -609,9 +610,10 @@ def test_where_only_efforts_were_measured_simulation_confirms_a_place(tmp_path):
     recordings = record(tmp_path, table=-0.012, n=2, effort="effort_measured")
     problem = PressingProblem(scene, recordings)
     there = [Effect("plane_height", [TABLE, WALL], {"height": -0.012})]
-    unused = (None, None, None)  # Fits and nuisances: the equations'.
+    start = fit_effects(problem, screen_of(problem), [])
+    fits = (start, start, problem.nuisances())  # The equations'.
     for held in (None, recordings):
-        outcome = problem.outcome(there, *unused, held)
+        outcome = problem.outcome(there, *fits, held)
         assert outcome.gap.before > 5.0
         assert outcome.gap.after < 2.0
 
@@ -784,7 +786,8 @@ def test_a_block_is_simulated_with_all_the_corners_that_it_presses_with(block):
     """Drake's point contact makes one of four: it goes in four times as deep, 0.3 mm
     more at 8 N, where noise is 10 um."""
     scene, recordings, problem = block
-    outcome = problem.outcome((), None, None, None, recordings)
+    start = fit_effects(problem, screen_of(problem), [])
+    outcome = problem.outcome((), start, start, problem.nuisances(), recordings)
     assert outcome.gap.before < 1.5  # What `no_gap` allows.
     names = {problem.shapes.names[one.ground] for one in problem.lying()}
     assert names == {TABLE, WALL}
