@@ -520,6 +520,30 @@ def _stands_for(m, n0, n1, n2, surfaces, on, count):
     return -1
 
 
+@njit(cache=True, inline="always")
+def _push_apart(F, T, s, a, b, a0, a1, a2, b0, b1, b2, depth, n0, n1, n2, law,
+                slip):  # fmt: skip
+    """Bodies a and b, which meet at the levers a0.. and b0.. from their centres of
+    mass, with the normal out of b: what they do to each other."""
+    u0 = s[a, 10] + s[a, 8] * a2 - s[a, 9] * a1
+    u1 = s[a, 11] + s[a, 9] * a0 - s[a, 7] * a2
+    u2 = s[a, 12] + s[a, 7] * a1 - s[a, 8] * a0
+    u0 -= s[b, 10] + s[b, 8] * b2 - s[b, 9] * b1
+    u1 -= s[b, 11] + s[b, 9] * b0 - s[b, 7] * b2
+    u2 -= s[b, 12] + s[b, 7] * b1 - s[b, 8] * b0
+    un = u0 * n0 + u1 * n1 + u2 * n2
+    fn = _normal_force(law[0], law[1], law[5], depth, un)
+    if fn <= 0.0:
+        return
+    u0, u1, u2, speed = _slip(u0, u1, u2, un, n0, n1, n2)
+    share = 0.0
+    if speed > 1e-14:
+        share = _friction(speed, slip, law[2], law[3]) * fn / speed
+    f0, f1, f2 = fn * n0 - share * u0, fn * n1 - share * u1, fn * n2 - share * u2
+    _push(F, T, a, a0, a1, a2, f0, f1, f2)
+    _push(F, T, b, b0, b1, b2, -f0, -f1, -f2)
+
+
 @njit(cache=True)
 def _meet(F, T, s, c, spheres, owner, i, j, law, slip):
     """Contact of the spheres i and j of two bodies."""
@@ -544,23 +568,7 @@ def _meet(F, T, s, c, spheres, owner, i, j, law, slip):
         c[j, 1] - s[b, 5] + rj * n1,
         c[j, 2] - s[b, 6] + rj * n2,
     )
-    u0 = s[a, 10] + s[a, 8] * a2 - s[a, 9] * a1
-    u1 = s[a, 11] + s[a, 9] * a0 - s[a, 7] * a2
-    u2 = s[a, 12] + s[a, 7] * a1 - s[a, 8] * a0
-    u0 -= s[b, 10] + s[b, 8] * b2 - s[b, 9] * b1
-    u1 -= s[b, 11] + s[b, 9] * b0 - s[b, 7] * b2
-    u2 -= s[b, 12] + s[b, 7] * b1 - s[b, 8] * b0
-    un = u0 * n0 + u1 * n1 + u2 * n2
-    fn = _normal_force(law[0], law[1], law[5], depth, un)
-    if fn <= 0.0:
-        return
-    u0, u1, u2, speed = _slip(u0, u1, u2, un, n0, n1, n2)
-    share = 0.0
-    if speed > 1e-14:
-        share = _friction(speed, slip, law[2], law[3]) * fn / speed
-    f0, f1, f2 = fn * n0 - share * u0, fn * n1 - share * u1, fn * n2 - share * u2
-    _push(F, T, a, a0, a1, a2, f0, f1, f2)
-    _push(F, T, b, b0, b1, b2, -f0, -f1, -f2)
+    _push_apart(F, T, s, a, b, a0, a1, a2, b0, b1, b2, depth, n0, n1, n2, law, slip)
 
 
 @njit(cache=True)
@@ -595,23 +603,7 @@ def _is_carried(F, T, s, b, o, p0, p1, p2, radius, box, law, slip):
     p0, p1, p2 = p0 - reach * n0, p1 - reach * n1, p2 - reach * n2
     a0, a1, a2 = p0 - s[b, 4], p1 - s[b, 5], p2 - s[b, 6]
     b0, b1, b2 = p0 - s[o, 4], p1 - s[o, 5], p2 - s[o, 6]
-    u0 = s[b, 10] + s[b, 8] * a2 - s[b, 9] * a1
-    u1 = s[b, 11] + s[b, 9] * a0 - s[b, 7] * a2
-    u2 = s[b, 12] + s[b, 7] * a1 - s[b, 8] * a0
-    u0 -= s[o, 10] + s[o, 8] * b2 - s[o, 9] * b1
-    u1 -= s[o, 11] + s[o, 9] * b0 - s[o, 7] * b2
-    u2 -= s[o, 12] + s[o, 7] * b1 - s[o, 8] * b0
-    un = u0 * n0 + u1 * n1 + u2 * n2
-    fn = _normal_force(law[0], law[1], law[5], -gap, un)
-    if fn <= 0.0:
-        return
-    u0, u1, u2, speed = _slip(u0, u1, u2, un, n0, n1, n2)
-    share = 0.0
-    if speed > 1e-14:
-        share = _friction(speed, slip, law[2], law[3]) * fn / speed
-    f0, f1, f2 = fn * n0 - share * u0, fn * n1 - share * u1, fn * n2 - share * u2
-    _push(F, T, b, a0, a1, a2, f0, f1, f2)
-    _push(F, T, o, b0, b1, b2, -f0, -f1, -f2)
+    _push_apart(F, T, s, b, o, a0, a1, a2, b0, b1, b2, -gap, n0, n1, n2, law, slip)
 
 
 @njit(cache=True)

@@ -123,8 +123,7 @@ class ContactProblem(ContactCandidates, GapProblem):
         # then these are shared out by them.
         left = self._without_nuisances()
         if max(size for size, _ in self._blocks_left(left)) > self.plan.loud:
-            calm = np.zeros(self._shown.shape)
-            calm[self._shown] = left
+            calm = self._in_table(left)
             self._share_out(calm)
 
     def weighed_by(
@@ -210,8 +209,7 @@ class ContactProblem(ContactCandidates, GapProblem):
 
     def _misfit(self, left: np.ndarray) -> np.ndarray:
         """(rows,) [N, N m] what held-out equations are off by beside sensors' noise."""
-        r = np.zeros(self._shown.shape)
-        r[self._shown] = left
+        r = self._in_table(left)
         n = len(self.allowance)
         held = ~self._train if not self._train.all() else self._train
         off = np.abs(self.in_newtons(r[:, :n])[held])
@@ -517,8 +515,7 @@ class ContactProblem(ContactCandidates, GapProblem):
         ] or [(0.0, 0)]
 
     def where(self, left: np.ndarray) -> list[Where]:
-        r = np.zeros(self._shown.shape)
-        r[self._shown] = left
+        r = self._in_table(left)
         m, names = self.means, self.row_names()
         found, p = [], []
         for number, t in enumerate(self.tracks):
@@ -607,8 +604,7 @@ class ContactProblem(ContactCandidates, GapProblem):
         n, noise = len(self.allowance), self.sensor_std()
         newtons = []
         for left in (before, after):
-            r = np.zeros(self._shown.shape)
-            r[self._shown] = left
+            r = self._in_table(left)
             newtons.append(self.in_newtons(r[:, :n]))
         slides = sliding_joints(self.plant)
         found = {}

@@ -39,8 +39,20 @@ class ContactRows(FeltWalls):
         return self._of_rows(np.arange(len(self.means.time)))
 
     def residual(self, effects: Sequence[Effect] = ()) -> np.ndarray:
-        r = self.left(effects, weighed_as=self._weights)
+        return self._clipped(effects, self._weights)
+
+    def _clipped(
+        self, effects: Sequence[Effect], weights: Sequence[Effect] | None = None
+    ) -> np.ndarray:
+        """(m,) residual by the weights of a model; None: by those of its own."""
+        r = self.left(effects, weighed_as=weights)
         return np.clip(self._flat(r), -LARGEST, LARGEST)
+
+    def _in_table(self, rows: np.ndarray) -> np.ndarray:
+        """(K, n) of values of rows (m,), 0 where there is none."""
+        table = np.zeros(self._shown.shape)
+        table[self._shown] = rows
+        return table
 
     def weighed_alike(self, one: Sequence[Effect], other: Sequence[Effect]):
         """A heavier body makes more noise of the same accelerations: by its own weights
@@ -50,16 +62,8 @@ class ContactRows(FeltWalls):
         would leave less. Of these each is weighed by its own.
         """
         if _gains(one) != _gains(other):
-            return [(self._own(one), self._own(other))]
-
-        def row(effects, weights):
-            r = self._flat(self.left(effects, weighed_as=weights))
-            return np.clip(r, -LARGEST, LARGEST)
-
-        return [(row(one, w), row(other, w)) for w in (one, other)]
-
-    def _own(self, effects: Sequence[Effect]) -> np.ndarray:
-        return np.clip(self._flat(self.left(effects)), -LARGEST, LARGEST)
+            return [(self._clipped(one), self._clipped(other))]
+        return [(self._clipped(one, w), self._clipped(other, w)) for w in (one, other)]
 
     def base(self) -> np.ndarray:
         if self._base is None:
