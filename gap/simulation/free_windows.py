@@ -217,9 +217,7 @@ class FreeBodyModel(WindowedResidual):
         ):
             if not any(self._numbers.rides(name, other) for other in self.bodies):
                 continue
-            poses = np.concatenate([_poses(name, r) for r in self.recordings])
-            each = [gaps(body, pose) for pose in poses[:: len(poses) // 500 + 1]]
-            least = np.min(each, axis=0, initial=np.inf)
+            least = np.min(self._gaps_seen(body, name), axis=0, initial=np.inf)
             grounds = np.array(one.grounds)
             for ground in set(one.grounds):
                 if least[grounds == ground].min() > FAR:
@@ -229,10 +227,14 @@ class FreeBodyModel(WindowedResidual):
     def _lies_on(self, body: FreeBody, name: str) -> np.ndarray:
         """(m,) on which of the fixed shapes a body lies nearly all the time, so that it
         never hits them."""
-        poses = np.concatenate([_poses(name, r) for r in self.recordings])
-        near = [gaps(body, pose) < NEAR for pose in poses[:: len(poses) // 500 + 1]]
+        near = [each < NEAR for each in self._gaps_seen(body, name)]
         share = np.mean(near, axis=0) if near else np.zeros(len(body.fixed))
         return share > MOSTLY
+
+    def _gaps_seen(self, body: FreeBody, name: str) -> list[np.ndarray]:
+        """gaps() at poses that are evenly spread over the recordings, 500 at most."""
+        poses = np.concatenate([_poses(name, r) for r in self.recordings])
+        return [gaps(body, pose) for pose in poses[:: len(poses) // 500 + 1]]
 
     @cached_property
     def met(self) -> dict[tuple[str, str], float]:
