@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.optimize import differential_evolution, least_squares, minimize
 
+from makebreak.gap.budget import go_on
 from makebreak.gap.numerics.selection import Screen, spread_by_blocks
 from makebreak.gap.problem import Fitted, GapProblem
 from makebreak.models.effects import KINDS
@@ -49,6 +50,7 @@ def fit_effects(
     def residual(z) -> np.ndarray:
         key = np.asarray(z).tobytes()
         if key not in cache:
+            go_on()
             cache[key] = problem.residual(free.effects(z))
         return cache[key]
 
@@ -134,6 +136,7 @@ def tangents(
     free = _Free(problem, fitted.effects, [tuple(names) for names in fixed])
     z, columns = free.x0 / free.scale, []
     for k in range(len(z)):
+        go_on()
         moved = np.array(z)
         moved[k] += problem.plan.diff_step
         try:
@@ -163,6 +166,7 @@ def derivative_free_search(
     free = _Free(problem, start, [tuple(names) for names in fixed])
 
     def cost(z) -> float:
+        go_on()
         if np.any(z * free.scale < free.low):
             return 1e6
         try:
@@ -246,6 +250,7 @@ def _try_rough(problem, screen, start: list[Effect], fixed):
                 continue
             tried = []
             for v in value * ROUGH:
+                go_on()
                 other = Effect(effect.kind, effect.at, {**effect.parameters, name: v})
                 r = problem.residual([*start[:i], other, *start[i + 1 :]])
                 tried.append((screen.evaluate(r).train, other))

@@ -7,11 +7,14 @@ import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, wait
 from typing import TypeVar
+
+from makebreak.gap.budget import go_on, present
 
 T = TypeVar("T")
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
+ASK_SEC = 0.1  # Whether to go on, while others compute.
 _calls: Sequence[Callable] = ()  # Of the pool that is being made: its copies have them.
 
 
@@ -41,6 +44,8 @@ def side_by_side(calls: Sequence[Callable[[], T]], jobs: int) -> Iterator[T]:
             warnings.simplefilter("ignore", DeprecationWarning)
             futures = [pool.submit(_call, k) for k in range(len(calls))]
         for future in futures:
+            while not wait([future], ASK_SEC).done:
+                go_on()
             yield future.result()
     except BaseException:  # Ctrl-C, or the caller has enough: nobody waits for these.
         for process in list((pool._processes or {}).values()):
@@ -59,6 +64,7 @@ def _of_parent(parent: int) -> None:
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:  # It was faster.
         os._exit(1)
+    present().in_a_copy()
 
 
 def _call(k: int):

@@ -266,6 +266,7 @@ class GapResult:
     channels: Sequence[JudgedChannel] = ()
     nuisance_scene: Sequence[Effect] = ()  # The links as the nuisances have them.
     differs: Sequence[Differs] = ()
+    unfinished: Sequence[str] = ()  # What a budget or an interrupt left undone.
 
     def __post_init__(self):
         if self.verdict not in VERDICTS:
@@ -288,6 +289,7 @@ class GapResult:
         return {
             "verdict": self.verdict,
             "says": self.says,
+            "unfinished": list(self.unfinished),
             "where": [dict(vars(each)) for each in self.where],
             "effects": [_effect_json(each) for each in self.effects],
             "gap": {

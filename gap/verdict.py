@@ -6,6 +6,7 @@ from math import isnan
 
 from pydrake.multibody.plant import MultibodyPlant
 
+from makebreak.gap.budget import present
 from makebreak.gap.data.recording import unit_of
 from makebreak.gap.problem import leaves_gap, share_left
 from makebreak.gap.result import Estimate, Evidence, GapMeasure, NamedEffect
@@ -228,9 +229,10 @@ def says(
             error += f"{after} in {places[1]}"
         if words and gap.before > AGREEMENT_RMS_MAX:
             error += f" ({before} without what is named)"
+        tried = "tried so far" if present().undone else "of the catalogue"
         return head + (
-            f"{'a' if head else 'A'} gap remains that no effect of the catalogue "
-            f"explains: held-out error {error}.{more}"
+            f"{'a' if head else 'A'} gap remains that no effect {tried} explains: "
+            f"held-out error {error}.{more}"
         )
     tail = ""
     if verdict == "ambiguous":

@@ -9,6 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from makebreak.gap.at_impacts import impacts_differ
+from makebreak.gap.budget import (
+    CONCLUDE,
+    LESS_SURE,
+    Budget,
+    Stopped,
+    go_on,
+    present,
+)
 from makebreak.gap.by_recording import (
     Alone,
     Together,
@@ -41,6 +49,7 @@ from makebreak.gap.problem import (
     Outcome,
     share_left,
 )
+from makebreak.gap.report.summary import says_of
 from makebreak.gap.residuals.command_times import set_command_times
 from makebreak.gap.residuals.contact_problem import ContactProblem
 from makebreak.gap.residuals.driven import DrivenProblem, is_driven, sticks
@@ -107,19 +116,58 @@ def run_gap(
     skip_bad_rows: bool = False,
     sidecars: Mapping[Path, Path] | None = None,
     doubts: Sequence[Finding] = (),
+    budget_min: float = float("inf"),
 ) -> GapResult:
     """Finds where a scene and recordings disagree, and names what the scene lacks.
 
     Args: jobs: processes at once. progress: called with a line of text now and then.
         skip_bad_rows, sidecars: as of read_recordings. doubts: what is to be said of
-        the scene beforehand.
+        the scene beforehand. budget_min: minutes after which the best answer so far is
+        given, with what was left undone in `unfinished`; not asked where a budget
+        (gap/budget.py) is running already.
     Raises: ValueError, one line, for a scene or recording that cannot be read or do
         not fit together.
     """
-    say = progress or (lambda text: None)
-    clock = _Clock()
+    if budget_min < float("inf"):
+        with Budget(60.0 * budget_min).running():
+            return run_gap(
+                scene_path, recording_paths, jobs, progress, skip_bad_rows, sidecars,
+                doubts,
+            )  # fmt: skip
+    budget, checks = present(), list(doubts)
+    stage = "reading scene and recordings"
+
+    def say(text: str) -> None:
+        nonlocal stage
+        if not text.startswith(" "):
+            stage = text
+        if progress is not None:
+            progress(text)
+
+    try:
+        result = _run(
+            scene_path, recording_paths, jobs, say, skip_bad_rows, sidecars, checks
+        )
+    except Stopped:
+        budget.leave(f"{stage}, and all that follows")
+        result = nothing_compared(checks)
+    return as_far_as_it_went(result, budget)
+
+
+def _run(
+    scene_path: str | Path,
+    recording_paths: Sequence[str | Path],
+    jobs: int,
+    say: Callable[[str], None],
+    skip_bad_rows: bool,
+    sidecars: Mapping[Path, Path] | None,
+    checks: list[Finding],
+) -> GapResult:
+    """What run_gap gives where nobody stops it. checks: findings are added there."""
+    budget, clock = present(), _Clock()
     seconds: dict[str, float] = {}
     scene = read_scene(scene_path)
+    go_on()
     recordings = read_recordings(recording_paths, skip_bad_rows, sidecars)
     recordings = in_newton_metres(recordings, scene.channels)
     dynamics = SceneDynamics(scene)
@@ -134,7 +182,8 @@ def run_gap(
     # What is reported on is cut off before anything is looked at.
     parts = split(recordings)
     say("checking the recordings")
-    checks = [*doubts, *check_recordings(parts.decided, scene_facts(dynamics.plant))]
+    go_on()
+    checks += check_recordings(parts.decided, scene_facts(dynamics.plant))
     checks += check_tool_weight(dynamics, parts.decided)
     is_mechanism = _is_mechanism(dynamics, recordings)
     # An impact would be smeared by means over rows.
@@ -161,38 +210,51 @@ def run_gap(
     seconds["select"] = clock.lap()
     say("simulating held-out windows")
     reported = excerpt(reported, REPORTED_SEC, REPORTED_ROWS) if reported else []
-    result = conclude(problem, selection, reported, checks, jobs)
+    with budget.part(CONCLUDE):
+        try:
+            result = conclude(problem, selection, reported, checks, jobs)
+        except Stopped:
+            budget.leave("simulating held-out windows")
+            result = in_equations_alone(problem, selection, checks)
     seconds["simulate"] = clock.lap()
+
+    def between_impacts(problem: FlightProblem) -> GapResult:
+        between = problem.between_impacts() if unnamed else None
+        if between is None:
+            return result
+        say("searching between impacts")
+        apart = conclude(between, select(between, say), reported, checks, jobs)
+        named_there = [each.effect() for each in apart.effects]
+        start = selection.start
+        whole = problem.outcome(
+            named_there, start, start, selection.nuisances, reported or None, jobs
+        )
+        return impacts_differ(problem, apart, whole) or result
+
+    def alone(name: str) -> Alone:
+        say(f"searching {name} separately")
+        mine, its = ([r for r in some if r.name == name]
+                     for some in (decided, reported))  # fmt: skip
+        one, _ = problem_for(scene, mine, dynamics, jobs)
+        selected = select(one, say)
+        return Alone(name, one, selected, conclude(one, selected, its, checks, jobs))
+
+    def one_by_one() -> GapResult:
+        if not may_differ(problem, selection.end, result):
+            return result
+        return with_differences(result, Together(problem, selection), alone)
+
     unnamed = result.verdict == "gap_unnamed" and not (
         result.effects and result.gap.reduction >= CLOSED_SHARE_MIN
     )
-    if isinstance(problem, FlightProblem) and unnamed:
-        between = problem.between_impacts()
-        if between is not None:
-            say("searching between impacts")
-            apart = conclude(between, select(between, say), reported, checks, jobs)
-            named_there = [each.effect() for each in apart.effects]
-            start = selection.start
-            whole = problem.outcome(
-                named_there, start, start, selection.nuisances, reported or None, jobs
-            )
-            result = impacts_differ(problem, apart, whole) or result
+    if isinstance(problem, FlightProblem):
+        result = budget.if_time(
+            "searching between impacts", partial(between_impacts, problem), result
+        )
         seconds["impacts"] = clock.lap()
-    if isinstance(problem, MechanismProblem) and may_differ(
-        problem, selection.end, result
-    ):
-
-        def alone(name: str) -> Alone:
-            say(f"searching {name} separately")
-            mine, its = ([r for r in some if r.name == name]
-                         for some in (decided, reported))  # fmt: skip
-            one, _ = problem_for(scene, mine, dynamics, jobs)
-            selected = select(one, say)
-            return Alone(
-                name, one, selected, conclude(one, selected, its, checks, jobs)
-            )
-
-        result = with_differences(result, Together(problem, selection), alone)
+    if isinstance(problem, MechanismProblem):
+        what = "comparing recordings one by one"
+        result = budget.if_time(what, one_by_one, result)
         seconds["recordings"] = clock.lap()
     return unless_doubtful(result).with_seconds(seconds)
 
@@ -276,6 +338,48 @@ def _contact_problem(
 ) -> tuple[ContactProblem, list[Finding]]:
     contact = contact_problem(scene, recordings)
     return contact, sap_lift(contact) + point_on_face(contact, contact.lying())
+
+
+def nothing_compared(checks: Sequence[Finding]) -> GapResult:
+    """Where a run ended before scene and recordings were compared."""
+    nan = float("nan")
+    says = "Scene and recordings were not compared."
+    return GapResult("not_judged", says, [], [], _nothing(nan, nan), [], {}, checks)
+
+
+def in_equations_alone(
+    problem: GapProblem, selection: Selection, checks: Sequence[Finding]
+) -> GapResult:
+    """Where a run ended before held-out windows were simulated: nothing is named, as
+    nothing is confirmed; what the search would have named is in the sentence."""
+    start, end = problem.error(selection.start), problem.error(selection.end)
+    tried = [says_of(effect) for effect in selection.effects()]
+    agrees = start <= AGREEMENT_RMS_MAX and not tried
+    words = f"What was fitted is off by {figure(start)} times the noise"
+    if tried:
+        words += f", by {figure(end)} times with what follows, which no simulation "
+        words += f"has confirmed: {'; '.join(tried)}"
+    return GapResult(
+        "not_judged" if agrees else "gap_unnamed", f"{words.rstrip('.')}.", [], [],
+        replace(_nothing(start, start), data="fitted"), [], {}, checks,
+        candidates=selection.table, channels=judged_channels(problem),
+    )  # fmt: skip
+
+
+def as_far_as_it_went(result: GapResult, budget: Budget) -> GapResult:
+    """The result, with what the budget left undone: first in the sentence, and among
+    the checks. What rests on everything having been tried is not said."""
+    if not budget.undone:
+        return result
+    words = f"{budget.why}; not done: {'; '.join(budget.undone)}."
+    finding = Finding("unfinished", "", "time", 0.0, "s", "warning", words)
+    return replace(
+        result,
+        verdict=LESS_SURE.get(result.verdict, result.verdict),
+        says=f"{words} {result.says}",
+        checks=[*result.checks, finding],
+        unfinished=tuple(budget.undone),
+    )
 
 
 def conclude(

@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping
 import makebreak
 from makebreak.models.typed_yaml import nearest
 
+BUDGET_MIN = 10.0  # Of `gap`.
+
 
 class CommandParser(argparse.ArgumentParser):
     """argparse, but with one line on stderr where the input is wrong, and no shortened
@@ -249,6 +251,13 @@ def make_parser(functions: Mapping[str, Callable]) -> argparse.ArgumentParser:
         help="skip rows that cannot be read, and print their number",
     )
     p.add_argument("--jobs", metavar="N", help="processes at once (one per core)")
+    p.add_argument(
+        "--budget",
+        metavar="MINUTES",
+        default=str(BUDGET_MIN),
+        help="minutes after which the best answer so far is written, with what was "
+        f"left undone (default: {BUDGET_MIN:g})",
+    )
     p.add_argument("--out", metavar="DIR", help="output folder (runs/gap-<time>)")
     p.add_argument(
         "--export",

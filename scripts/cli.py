@@ -24,7 +24,7 @@ from makebreak.scripts.command_inputs import (
     scenes,
 )
 from makebreak.scripts.faults import fault, is_drakes, on_purpose, refused
-from makebreak.scripts.interrupts import interrupts
+from makebreak.scripts.interrupts import CatchInterrupt, interrupts
 from makebreak.scripts.outputs import check_written, default_out, print_files
 from makebreak.scripts.parent import end_with_parent
 from makebreak.scripts.run_command import run, station
@@ -181,6 +181,11 @@ def _sweep(args) -> int:
 
 
 def _gap(args) -> int:
+    with CatchInterrupt() as interrupt:
+        return _gap_until(args, interrupt)
+
+
+def _gap_until(args, interrupt) -> int:
     from makebreak.gap.data.bags import is_bag, is_dataset
     from makebreak.scripts.gap_command import effects_table, run_and_report
 
@@ -204,9 +209,10 @@ def _gap(args) -> int:
     out = Path(args.out) if args.out else default_out("gap")
     export = [word for word in (args.export or "").split(",") if word]
     try:
-        result, files, notes = run_and_report(
+        result, files, notes, is_interrupted = run_and_report(
             scene, recordings, out, number_of_processes(args.jobs), export, is_robot,
-            args.skip_bad_rows,
+            args.skip_bad_rows, number(args.budget, "--budget", 0.0),
+            lambda: interrupt.hit,
         )  # fmt: skip
     except (Exception, SystemExit) as error:
         if on_purpose(error) or isinstance(error, OSError):
@@ -217,7 +223,7 @@ def _gap(args) -> int:
     for note in notes:
         print(note)
     print_files(files)
-    return 0
+    return 130 if is_interrupted else 0
 
 
 def _inspect(args) -> int:

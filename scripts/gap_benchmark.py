@@ -118,7 +118,8 @@ def run_benchmark(
     for name, out in zip(names, folders, strict=True):
         recordings = sorted((cases / name).glob("recording*.csv"))
         files = [str(cases / name / "scene.yaml"), *map(str, recordings)]
-        words = ["gap", *files, "--jobs", "1", "--out", str(out)]
+        minutes = str(CASE_LIMIT_SEC / 60.0)  # What takes long is compared, too.
+        words = ["gap", *files, "--jobs", "1", "--budget", minutes, "--out", str(out)]
         commands.append(makebreak_command(*words))
     truths = json.loads(truth_file.read_text())
     scores: dict[str, Score] = {}

@@ -3,15 +3,17 @@
 import json
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from math import isfinite
 from pathlib import Path
 from shlex import quote
 from time import perf_counter
 
 from tqdm import tqdm
 
+from makebreak.gap.budget import REPORT, Budget
 from makebreak.gap.data.findings import NO_COLUMN, Finding
 from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.data.sidecar import has_sidecar, sidecar_of
@@ -21,48 +23,70 @@ from makebreak.gap.report.summary import next_best, summary_lines, windows_of
 from makebreak.gap.result import GapResult
 from makebreak.models.scene import Scene, read_scene
 from makebreak.models.typed_yaml import read_yaml
+from makebreak.scripts.arguments import BUDGET_MIN
 from makebreak.scripts.interrupts import undisturbed
-from makebreak.scripts.outputs import OutputFolder
+from makebreak.scripts.outputs import OutputFolder, print_files
 from makebreak.scripts.table import Table
 
 EXPORTS = ("urdf", "mjcf")
+NO_ANIMATION = "compare.html was not made"
 
 
 class StageBar:
-    """A progress bar with a line of text for the present stage, for a `with`.
+    """A line with the time so far, the stage, and what is tried in it, for a `with`.
 
-    As the number of effects to be found is not known, each call advances it by a tenth
-    of the remainder (a fiftieth for indented text), unless `share`, 0 to 1, is given.
+    How many effects there are to be found is not known, so it shows no share of the
+    work; the time that it may take is known where there is a budget [s].
     """
 
-    def __init__(self, shown: bool = True):
+    def __init__(self, shown: bool = True, budget_sec: float = float("inf")):
         self.started = False  # Whether any stage was reported.
+        self._stage, self._stops = "", False
         tty = sys.stderr.isatty()
+        most = ""
+        if budget_sec < float("inf"):
+            most = f" of at most {tqdm.format_interval(budget_sec)}"
+        self._every = 0.5 if tty else 10.0
         self._bar = tqdm(
-            total=1.0,
-            bar_format="{percentage:3.0f}%|{bar:24}| {elapsed} {desc}",
-            mininterval=0.2 if tty else 10.0,
+            desc="reading scene and recordings",
+            bar_format=f"{{elapsed}}{most}  {{desc}}",
             dynamic_ncols=tty,
             ncols=None if tty else 100,
             disable=not shown,
             file=sys.stderr,
         )
+        self._shown_at = perf_counter()
 
-    def __call__(self, text: str, share: float | None = None) -> None:
+    def __call__(self, text: str) -> None:
+        """A stage; or, indented, what is tried in it."""
+        is_stage = not text.startswith(" ")
+        self._stage = text if is_stage else self._stage
+        shown = text if is_stage else f"{self._stage}: {text.strip()}"
+        self._bar.set_description_str(shown, refresh=False)
         self.started = True
-        if share is None:
-            step = 0.02 if text.startswith(" ") else 0.1
-            share = self._bar.n + step * (1.0 - self._bar.n)
-        self._bar.set_description_str(text.strip(), refresh=False)
-        self._bar.update(min(max(share, self._bar.n), 1.0) - self._bar.n)
-        self._bar.refresh()
+        self.tick(now=is_stage)
+
+    def tick(self, now: bool = False) -> None:
+        """Shows the time so far, if it is time for that."""
+        if now or perf_counter() > self._shown_at + self._every:
+            self._shown_at = perf_counter()
+            self._bar.refresh()
+
+    def stops(self) -> None:
+        """Says once that it was asked to end."""
+        if not self._stops:
+            self._stops = True
+            self._bar.write(
+                "Ending with what is found so far; once more: at once.",
+                file=sys.stderr,
+            )
 
     def __enter__(self) -> "StageBar":
         return self
 
     def __exit__(self, kind, *_) -> None:
         if kind is None:
-            self("done", 1.0)
+            self("done")
         self._bar.close()
 
 
@@ -74,40 +98,61 @@ def run_and_report(
     export: Sequence[str] = (),
     is_robot: bool = False,
     skip_bad_rows: bool = False,
-) -> tuple[GapResult, list[Path], list[str]]:
-    """The workflow's result, the files written, and notes for the user.
+    budget_min: float = BUDGET_MIN,
+    interrupted: Callable[[], bool] = lambda: False,
+) -> tuple[GapResult, list[Path], list[str], bool]:
+    """The workflow's result, the files written, notes for the user, and whether it was
+    interrupted.
 
     Args: export: formats of EXPORTS in which the repaired model is written too;
         is_robot: whether scene_path is a robot's own URDF or MJCF. Then a scene is
         proposed for it, with a sidecar for each recording that has none, and both are
-        written too.
+        written too. budget_min: minutes after which the best answer so far is
+        written; interrupted: whether it is to be written as soon as possible.
     Raises: ValueError for a scene, a recording or a folder that cannot be used.
     """
-    from makebreak.gap.workflow import run_gap  # Here, as it takes long to import.
-
     start = perf_counter()
     given = scene_path
     inputs = [scene_path, *recording_paths]
     doubts: Sequence[Finding] = ()
     sidecars = {} if is_robot else sidecars_beside(scene_path, recording_paths)
     notes = [f"{log.name}: columns as in {own}" for log, own in sidecars.items()]
+    seconds = 60.0 * budget_min
     with OutputFolder(out_dir, "gap", inputs) as out:
         if is_robot:
             scene_path, sidecars, notes, doubts = _proposed(
                 scene_path, recording_paths, out, out_dir
             )
+            print_files(out.keep(), sys.stderr)
         if export:  # Raises before anything is computed.
             exported(read_scene(scene_path), export)
+        from makebreak.gap.workflow import run_gap  # Here, as it takes long to import.
+
+        def asked() -> bool:
+            if interrupted():
+                progress.stops()
+            return interrupted()
+
         try:
-            with StageBar() as progress:
+            with (
+                StageBar(budget_sec=seconds) as progress,
+                Budget(seconds, asked, progress.tick).running() as budget,
+            ):
                 result = run_gap(
                     scene_path, recording_paths, jobs, progress, skip_bad_rows,
                     sidecars, doubts,
                 )  # fmt: skip
-                progress("writing the report", 0.95)
+                progress("writing the report")
                 scene = read_scene(scene_path)
                 recordings = read_recordings(recording_paths, skip_bad_rows, sidecars)
-                moving = comparison_html(result, scene, recordings)
+                with budget.part(REPORT):
+                    moving = budget.if_time(
+                        NO_ANIMATION,
+                        lambda: comparison_html(result, scene, recordings),
+                        None,
+                    )
+                if NO_ANIMATION in budget.undone:
+                    notes.append(f"{budget.why}: {NO_ANIMATION}.")
                 folder = out.stage
                 write_report(result, scene, folder, recordings, given, moving, out_dir)
                 effects = [*scene.effects, *result.scene_effects()]
@@ -126,7 +171,8 @@ def run_and_report(
         times = {"wall_s": perf_counter() - start, "stages_s": dict(result.seconds)}
         out.file("timing.json").write_text(json.dumps(times, indent=2) + "\n")
         with undisturbed():
-            return result, out.commit(), notes
+            files = out.commit(complete=not budget.is_interrupted)
+        return result, files, notes, budget.is_interrupted
 
 
 def sidecars_beside(
@@ -225,11 +271,12 @@ def effects_table(result: GapResult) -> Table:
         )
         rows.append((each.kind, list(each.at), values, next_best(each.evidence) or "-"))
     g = result.gap
-    note = (
-        f"held-out error: {g.before:.3g} before, {g.after:.3g} after, in units of the "
-        f"noise (rms over {windows_of(result)}; a perfect model leaves 1)"
-    )
-    notes = [note]
+    notes = []
+    if isfinite(g.before):
+        notes.append(
+            f"held-out error: {g.before:.3g} before, {g.after:.3g} after, in units of "
+            f"the noise (rms over {windows_of(result)}; a perfect model leaves 1)"
+        )
     if g.in_equations:
         before, after = g.in_equations
         notes.append(

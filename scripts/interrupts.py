@@ -7,8 +7,10 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from time import monotonic
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+TWICE_SEC = 1.0
 _GONE = select.POLLHUP | select.POLLERR | select.POLLNVAL
 
 
@@ -30,17 +32,24 @@ def handled(handler: Callable[[int, object], None]) -> Iterator[None]:
 
 class CatchInterrupt:
     """While entered, Ctrl-C sets `hit`, as SIGTERM and SIGHUP do; the second Ctrl-C
-    raises KeyboardInterrupt."""
+    raises KeyboardInterrupt, and so does a SIGTERM a second or more later."""
 
     def __init__(self):
         self.hit = False
+        self._since = 0.0
         self._handled = handled(self._handle)
 
     def _handle(self, number, _):
         leave_terminal(number)
-        # The others may come twice by themselves, as when a terminal is closed.
-        if self.hit and number == signal.SIGINT:
+        # The others may come twice by themselves, as when a terminal is closed, or from
+        # `timeout`, which tells the process and its group.
+        meant = number == signal.SIGINT or (
+            number == signal.SIGTERM and monotonic() > self._since + TWICE_SEC
+        )
+        if self.hit and meant:
             raise KeyboardInterrupt
+        if not self.hit:
+            self._since = monotonic()
         self.hit = True
 
     def __enter__(self):

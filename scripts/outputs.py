@@ -9,6 +9,7 @@ from collections.abc import Iterable, Sequence
 from datetime import datetime
 from hashlib import sha256
 from pathlib import Path
+from typing import TextIO
 
 MARK = ".makebreak.json"  # Names the command that wrote the folder, and its files.
 STAGE = ".unfinished"  # Folder in which files are written before they are moved.
@@ -51,6 +52,7 @@ class OutputFolder:
         self.salvaged: Path | None = None  # Recordings of a run that was killed.
         self._lock: int | None = None
         self._made: list[Path] = []  # Folders that did not exist before.
+        self._kept: list[Path] = []
         for each in inputs:
             if self._may_write(Path(each)):
                 self._refuse(f"holds {Path(each).name}, which this command reads")
@@ -173,6 +175,37 @@ class OutputFolder:
             if path.is_file() and path != self.stage / _LOCK
         ]
 
+    def keep(self) -> list[Path]:
+        """Copies the files so far to their places, incomplete, for whoever needs them
+        before the end, or should the process be killed; `commit` replaces them.
+
+        Returns: the files at their places.
+        """
+        target, old = self._place_of_incomplete()
+        files = self.written()
+        digests = {p.relative_to(self.stage).as_posix(): _digest(p) for p in files}
+        target.mkdir(exist_ok=True)
+        self._mark(target, old | digests, complete=False)
+        for name, path in zip(digests, files, strict=True):
+            place = target / name
+            place.parent.mkdir(parents=True, exist_ok=True)
+            if os.path.lexists(place) and name not in old:
+                os.replace(place, _free(place))  # The user's.
+            shutil.copyfile(path, place)
+        self._made.clear()
+        if target == self.path:
+            self._old = _read_mark(target)
+        self._kept = [target / name for name in digests]
+        return self._kept
+
+    def _place_of_incomplete(self) -> tuple[Path, dict[str, str]]:
+        """The folder of files of a run that is not complete, beside an older one that
+        is, and the files there that commands wrote."""
+        if not self._old.get("complete"):
+            return self.path, self._old.get("files", {})
+        target = self.path / KEPT
+        return target, _read_mark(target).get("files", {})
+
     def commit(self, complete: bool = True) -> list[Path]:
         """Moves all files to their places, and closes the folder.
 
@@ -182,9 +215,8 @@ class OutputFolder:
         """
         target = self.path
         old: dict[str, str] = self._old.get("files", {})
-        if not complete and self._old.get("complete"):
-            target = self.path / KEPT
-            old = _read_mark(target).get("files", {})
+        if not complete:
+            target, old = self._place_of_incomplete()
             target.mkdir(exist_ok=True)
         new = {path.relative_to(self.stage).as_posix(): path for path in self.written()}
         digests = {name: _digest(path) for name, path in new.items()}
@@ -206,6 +238,9 @@ class OutputFolder:
         for name in old.keys() - new.keys():
             (target / name).unlink(missing_ok=True)
         self._mark(target, digests, complete)
+        for kept in self._kept if complete else ():
+            if kept.parent == self.path / KEPT:
+                kept.unlink(missing_ok=True)
         self._made.clear()
         self.close()
         return [target / name for name in new]
@@ -281,13 +316,13 @@ def default_out(name: str) -> Path:
     return path
 
 
-def print_files(files: Sequence[Path]) -> None:
+def print_files(files: Sequence[Path], to: TextIO | None = None) -> None:
     """Prints which files were written, and where: in their common folder, as an
-    interrupted run may have a subfolder."""
+    interrupted run may have a subfolder. to: None: the standard output."""
     if files:
         folder = Path(os.path.commonpath([path.parent for path in files]))
         names = " ".join(path.relative_to(folder).as_posix() for path in files)
-        print(f"Files in {folder}: {names}", flush=True)
+        print(f"Files in {folder}: {names}", flush=True, file=to)
 
 
 def check_written(session) -> None:

@@ -120,21 +120,20 @@ def test_ctrl_c_ends_it_in_one_line_and_130(workflow, case, monkeypatch, capsys)
     assert capsys.readouterr().err.splitlines()[-1] == "makebreak: interrupted"
 
 
-def test_the_bar_never_goes_back_and_is_full_only_at_the_end(capsys):
-    def shares():
-        return [int(x) for x in re.findall(r"(\d+)%", capsys.readouterr().err)]
-
-    with StageBar() as bar:
-        for k in range(40):
-            bar(f"stage {k}")
-        bar("backwards", 0.1)
-        seen = shares()
-    assert seen == sorted(seen) and 0 < seen[-1] < 100
-    assert shares()[-1] == 100
+def test_the_bar_shows_time_and_stage_and_no_share_that_nobody_knows(capsys):
+    with StageBar(budget_sec=600.0) as bar:
+        bar("searching")
+        bar("  payload at p.l1: 3.2")
+        bar.tick(now=True)
+        shown = capsys.readouterr().err
+    assert "%" not in shown and "00:00 of at most 10:00" in shown
+    assert shown.index("searching") < shown.index("searching: payload at p.l1: 3.2")
+    assert "done" in capsys.readouterr().err
     with pytest.raises(ValueError), StageBar() as bar:
-        bar("fit", 0.25)
+        bar("fit")
         raise ValueError
-    assert shares()[-1] == 25
+    shown = capsys.readouterr().err
+    assert "done" not in shown and "at most" not in shown
 
 
 def test_the_table_has_one_pair_of_held_out_errors(case):

@@ -8,9 +8,9 @@ from makebreak.gap.data.recording import Recording
 from makebreak.gap.report import sections
 from makebreak.gap.report.markup import STYLE, image, sentence_html
 from makebreak.gap.report.summary import (
-    HEADINGS,
     closed_share,
     doubts,
+    heading_of,
     next_best,
     number,
     says_of,
@@ -33,7 +33,7 @@ def report_html(
     Args: pictures: PNG files by name. out: the folder where the page will be. The
         others: as of files.write_report.
     """
-    heading, _ = HEADINGS[result.verdict]
+    heading, _ = heading_of(result)
     below = [
         sections.where(result, pictures, recordings),
         sections.series(result, pictures),
@@ -60,7 +60,7 @@ def report_html(
 
 def _first_screen(result: GapResult, pictures: Mapping[str, bytes]) -> str:
     """The verdict, its effects, and how much of the gap they close."""
-    heading, colour = HEADINGS[result.verdict]
+    heading, colour = heading_of(result)
     says = "Held-out error of each channel, before and after"
     parts = [
         f'<p class="badge" style="background:{colour}">{escape(heading)}</p>',
@@ -127,7 +127,9 @@ def _ties(each: NamedEffect) -> str:
 
 
 def _no_effect(result: GapResult) -> str:
-    if result.verdict == "no_gap":
+    if result.unfinished:
+        says = "The run ended before all was tried: nothing was added to the scene."
+    elif result.verdict == "no_gap":
         says = "The model explains the recording to within its noise and the stated "
         says += "tolerance of the model. Nothing was added to the scene."
     elif result.verdict == "not_judged":

@@ -19,9 +19,20 @@ HEADINGS = {  # Of each verdict, and its colour on the page.
 LEAST_GAP = 0.05  # Of the noise floor: less above it, and its share is noise.
 
 
+def heading_of(result: GapResult) -> tuple[str, str]:
+    """The verdict in words, and its colour on the page."""
+    heading, colour = HEADINGS[result.verdict]
+    if not result.unfinished:
+        return heading, colour
+    if not np.isfinite(result.gap.before):
+        return "Unfinished: nothing compared", colour
+    so_far = {"not_judged": "no gap so far", "gap_unnamed": "gap not explained so far"}
+    return f"Unfinished: {so_far.get(result.verdict, 'gap named so far')}", colour
+
+
 def summary_lines(result: GapResult) -> list[str]:
     """The end of the command line's run: the verdict, and a line for each effect."""
-    lines = [f"{HEADINGS[result.verdict][0]}: {result.says}"]
+    lines = [f"{heading_of(result)[0]}: {result.says}"]
     lines += [f"  Doubtful data: {each}" for each, _ in doubts(result)]
     for each in result.effects:
         if each.says not in result.says:

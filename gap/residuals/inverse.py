@@ -12,6 +12,7 @@ from functools import partial
 
 import numpy as np
 
+from makebreak.gap.budget import go_on
 from makebreak.gap.data.recording import Recording
 from makebreak.gap.residuals.track import Track
 from makebreak.gap.residuals.whitened_rows import WhitenedRows
@@ -33,7 +34,8 @@ from makebreak.systems.numerics.filters import LowPass, filtered, with_lag
 # Loops of drives run at a kilohertz or more: what they hold is late by half a period.
 LOOP_SEC = 2.5e-4
 LEAST_GAIN = 0.05  # That equations are divided by.
-MOST_MOTIONS, MOST_MEANS, MOST_DYNAMICS = 40, 1500, 8  # That are kept in memory.
+# That are kept in memory; efforts by row are large, and few come again.
+MOST_MOTIONS, MOST_MEANS, MOST_DYNAMICS, MOST_EFFORTS = 40, 1500, 8, 100
 
 
 class InverseModel(WhitenedRows):
@@ -47,6 +49,7 @@ class InverseModel(WhitenedRows):
         self._needed: dict[tuple, tuple[Motion, np.ndarray]] = {}
         # Means over bumps that come again and again in a fit.
         self._means: dict = {}
+        self._efforts: dict = {}  # The same of efforts by row, the last used last.
         self._heavier: dict[tuple, SceneDynamics] = {}
 
     def base(self) -> np.ndarray:
@@ -142,17 +145,26 @@ class InverseModel(WhitenedRows):
         """(n_bumps, n_v) means over bumps of what a track's equations leave, and its
         motion with the effort that acts."""
         motion, needed = self._moved_by(k, moving)
+        where = (k, tuple(e.key for e in moving), dynamics)
         if dynamics is not self.dynamics:
-            needed = motion.effort - dynamics.residual(motion)
+            needed = self._effort_of(
+                where, lambda: motion.effort - dynamics.residual(motion)
+            )
         # A gear's loss goes with what all the others need.
         for effect in sorted(ours, key=lambda e: KINDS[e.kind].on_top is not None):
             on_top = KINDS[effect.kind].on_top
             if on_top is not None:
                 needed = needed + on_top(effect, dynamics, motion, needed)
                 continue
-            needed = needed + _added(effect, dynamics, motion)
-        motion = self._driven_by(k, motion, effects)
-        return self.tracks[k].bumps.mean(motion.effort - needed), motion
+            needed = needed + self._effort_of(
+                (where, effect.key), partial(_added, effect, dynamics, motion)
+            )
+        path = tuple(e.key for e in effects if e.kind in SENSED + PATH)
+        driven = self._effort_of(
+            (where, path), lambda: self._driven_by(k, motion, effects).effort
+        )
+        motion = replace(motion, effort=driven)
+        return self.tracks[k].bumps.mean(driven - needed), motion
 
     def _unmet_sum(self, k: int, dynamics, effects, heavy, ours, moving):
         """The same where effects add up: what each of them adds is kept, as a fit
@@ -185,10 +197,19 @@ class InverseModel(WhitenedRows):
     def _kept(self, key, compute: Callable[[], np.ndarray]) -> np.ndarray:
         """What was computed for a key before, or now."""
         if key not in self._means:
+            go_on()
             if len(self._means) > MOST_MEANS:
                 self._means.clear()
             self._means[key] = compute()
         return self._means[key]
+
+    def _effort_of(self, key, compute: Callable[[], np.ndarray]) -> np.ndarray:
+        """The same of efforts by row: those that are used least go first."""
+        found = self._efforts.pop(key) if key in self._efforts else compute()
+        self._efforts[key] = found
+        if len(self._efforts) > MOST_EFFORTS:
+            del self._efforts[next(iter(self._efforts))]
+        return found
 
     def _moved_by(self, k: int, moving: Sequence[Effect]) -> tuple[Motion, np.ndarray]:
         """A track's motion, and the effort that the scene as it came needs for it."""

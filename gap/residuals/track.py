@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from makebreak.gap.budget import go_on
 from makebreak.gap.data.filters import FILTERED_SEC
 from makebreak.gap.data.recording import Episode, Recording
 from makebreak.gap.numerics.weak_form import Bumps, make_bumps
@@ -158,6 +159,7 @@ def _smoothed(recording, episode, joints, noise, time, middle):
             return None
         seen = np.concatenate([y, np.full(len(time), np.nan)])[order]
         stages = recording.channels[f"{joint}.position"].stages or ()
+        go_on()
         x = smooth_filtered(grid, seen, noise[i], stages).x
         q[:, i], v[:, i], vd[:, i] = x.T
     return grid, q, v, vd

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from makebreak.gap.budget import present
 from makebreak.gap.fit import fit_effects
 from makebreak.gap.numerics.selection import (
     Screen,
@@ -43,6 +44,7 @@ class Comparison:
 
     def __init__(self, problem: GapProblem, say: Callable[[str], None]):
         self.problem, self.say, self.plan = problem, say, problem.plan
+        self.budget = present()
         self.train = problem.train()
         self.channel = problem.channel_of_rows()
         self.start_again()
@@ -51,6 +53,14 @@ class Comparison:
         """Nuisances and the fit without effects, by the rows' weights of now."""
         self.nuisances = self.problem.nuisances()
         self.start = fit_effects(self.problem, self.screen(self.problem.base()), ())
+
+    def if_time(
+        self, what: str, step: Callable, chosen: Sequence[Choice], current: Fitted
+    ) -> tuple[list[Choice], Fitted]:
+        """What a step makes of the choices and their fit; where time is up before, they
+        stay as they are, and `what` is noted as undone."""
+        as_it_is = (list(chosen), current)
+        return self.budget.if_time(what, lambda: step(chosen, current), as_it_is)
 
     def screen(
         self, r: np.ndarray, scale: float = 1.0, reach: float | None = None, slopes=None

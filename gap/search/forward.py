@@ -3,8 +3,10 @@ step back to a tie where the gap stays unexplained."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 
+from makebreak.gap.budget import Stopped
 from makebreak.gap.fit import derivative_free_search, fit_effects
 from makebreak.gap.problem import Fitted
 from makebreak.gap.result import Considered
@@ -60,11 +62,20 @@ def forward(search: Comparison) -> Path:
     """Adds effects until nothing more earns its place. If much is left then, steps
     back to each tie in turn and takes the other effect: what is added after it tells
     two apart that did equally well when the choice was made."""
-    path = _to_the_end(search, Path((State((), search.start),)))
-    for steps, k, branch in _branches(search, path):
-        path = _better(search, path, steps, k, branch)
-        if not _is_unexplained(search, path.end.fitted):
-            break
+    path, rivals = Path((State((), search.start),)), Rivals(search)
+    try:
+        while not path.ended:
+            path = _step(search, rivals, path)
+    except Stopped:
+        search.budget.leave("looking for further effects")
+        return path
+    try:
+        for steps, k, branch in _branches(search, path):
+            path = _better(search, path, steps, k, branch)
+            if not _is_unexplained(search, path.end.fitted):
+                break
+    except Stopped:
+        search.budget.leave("trying ties in the place of effects")
     return path
 
 
@@ -88,17 +99,30 @@ def _step(search: Comparison, rivals: Rivals, path: Path) -> Path:
     chosen = [*path.end.chosen, *step.added]
     current = _converged(search, chosen, step.fitted)
     chosen = refreshed(chosen, current)  # The next fit starts from here.
-    if problem.reweigh(current):
-        # Less is left than models were taken to be off by, or noise is another in them.
-        search.start_again()
-        current = search.refit(chosen, current)
-        chosen = refreshed(chosen, current)
-    chosen, current = merge(search, chosen, current)
-    chosen, current = refine(search, chosen, current)
-    if search.plan.own_values and search.needs_more(current):
+    with search.budget.held():
+        if problem.reweigh(current):
+            # Less is left than models were taken to be off by, or noise is another in
+            # them.
+            search.start_again()
+            current = search.refit(chosen, current)
+            chosen = refreshed(chosen, current)
+    better = [merge, refine]
+    if search.plan.own_values:
         # Else another effect would stand for what joints do not share.
-        chosen, current = with_own_values(search, chosen, current)
+        better.append(_with_own_values_if_needed)
+    for of in better:
+        chosen, current = search.if_time(
+            "improving the last effects", partial(of, search), chosen, current
+        )
     return path.plus(State(tuple(chosen), current), step.table)
+
+
+def _with_own_values_if_needed(
+    search: Comparison, chosen: Sequence[Choice], current: Fitted
+) -> tuple[list[Choice], Fitted]:
+    if not search.needs_more(current):
+        return list(chosen), current
+    return with_own_values(search, chosen, current)
 
 
 def _converged(search: Comparison, chosen: Sequence[Choice], current: Fitted) -> Fitted:
@@ -111,11 +135,15 @@ def _converged(search: Comparison, chosen: Sequence[Choice], current: Fitted) ->
             break
         screen = search.screen(current.r, current.fit.train)
         effects = current.effects
-        if jumps:
-            effects = derivative_free_search(
-                search.problem, screen, effects, fixed, far
-            )
-        more = fit_effects(search.problem, screen, effects, fixed, steps)
+        try:
+            if jumps:
+                effects = derivative_free_search(
+                    search.problem, screen, effects, fixed, far
+                )
+            more = fit_effects(search.problem, screen, effects, fixed, steps)
+        except Stopped:
+            search.budget.leave("the last fit to its end")
+            break
         if more.fit.train < current.fit.train:
             current = more
     return current

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from makebreak.gap.budget import go_on
 from makebreak.gap.numerics.selection import LinearFit, Screen
 from makebreak.gap.problem import Candidate
 from makebreak.models.effects.kind import Effect
@@ -33,6 +34,7 @@ def rank(screen: Screen, found: Sequence[Candidate]) -> list[Ranked]:
     training rows best is judged. Of a group any member may be none (it is pruned)."""
     ranked = []
     for candidate in found:
+        go_on()
         fits = [screen.fit(columns) for columns in candidate.columns]
         k = min(range(len(fits)), key=lambda i: fits[i].train)
         effects = candidate.effects(k, fits[k].c)

@@ -22,7 +22,9 @@ comparison.py says what "better" means in all of them, gap/thresholds.py by how 
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
+from makebreak.gap.budget import PRUNE
 from makebreak.gap.fit import fit_effects
 from makebreak.gap.numerics.selection import is_plausible
 from makebreak.gap.problem import Fitted, GapProblem
@@ -49,26 +51,45 @@ def select(
     search = Comparison(problem, say)
     path = forward(search)
     chosen, current = _reweighed(search, list(path.end.chosen), path.end.fitted)
-    table = path.table
-    if search.plan.own_values and chosen:
-        chosen, current = with_own_values(search, chosen, current)
-    chosen, current = drop_needless(search, chosen, current)
-    chosen, current = simplify(search, chosen, current)
-    if chosen:
-        chosen, current = keep_certain(search, chosen, current)
-    chosen, current = _reweighed(search, chosen, current)
+    with search.budget.part(PRUNE):
+        chosen, current = _pruned(search, chosen, current)
+        chosen = search.budget.if_time(
+            "looking for ties", lambda: _with_ties(search, chosen, current), chosen
+        )
+    beyond = search.nuisances_beyond(current)
+    far = bool(beyond) or not is_plausible(current.b, search.nuisances.prior)
+    return Selection(
+        tuple(chosen), search.start, current, search.nuisances, path.table, beyond, far
+    )
+
+
+def _pruned(
+    search: Comparison, chosen: list[Choice], current: Fitted
+) -> tuple[list[Choice], Fitted]:
+    steps: dict[str, list[Callable]] = {
+        "dropping what is not needed": [drop_needless, simplify],
+        "whether each effect is certain": [keep_certain],
+    }
+    if search.plan.own_values:
+        steps = {"a value for each joint": [with_own_values], **steps}
+    for what, each in steps.items():
+        for step in each if chosen else ():
+            chosen, current = search.if_time(
+                what, partial(step, search), chosen, current
+            )
+    return _reweighed(search, chosen, current)
+
+
+def _with_ties(
+    search: Comparison, chosen: list[Choice], current: Fitted
+) -> list[Choice]:
     if any(c.paired for c in chosen):
         chosen = with_rivals_of_pairs(search, chosen, current)
     chosen = [
         replace(c, ties=still_tied(search, chosen, current, k))
         for k, c in enumerate(chosen)
     ]
-    chosen = with_rival_sets(search, chosen, current)
-    beyond = search.nuisances_beyond(current)
-    far = bool(beyond) or not is_plausible(current.b, search.nuisances.prior)
-    return Selection(
-        tuple(chosen), search.start, current, search.nuisances, table, beyond, far
-    )
+    return with_rival_sets(search, chosen, current)
 
 
 def _reweighed(
@@ -76,10 +97,11 @@ def _reweighed(
 ) -> tuple[list[Choice], Fitted]:
     """By the weights of what is chosen: those of a branch that was given up, or of an
     effect that was dropped, may be left."""
-    if not search.problem.reweigh(current):
-        return chosen, current
-    search.start_again()
-    current = search.refit(chosen, current) if chosen else search.start
+    with search.budget.held():
+        if not search.problem.reweigh(current):
+            return chosen, current
+        search.start_again()
+        current = search.refit(chosen, current) if chosen else search.start
     return refreshed(chosen, current), current
 
 

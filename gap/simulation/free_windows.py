@@ -14,6 +14,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
+from makebreak.gap.budget import go_on
 from makebreak.gap.data.recording import Episode, Recording
 from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.numerics.free_body import (
@@ -586,6 +587,7 @@ class FreeBodyModel(WindowedResidual):
     ) -> np.ndarray:
         """(n, n_channels) of a window. Args: lengths (n_bodies,): that a camera sees of
         a metre. unseen: as of _unseen_spins()."""
+        go_on()
         start = np.empty((len(self.bodies), 13))
         for k, (body, length) in enumerate(zip(bodies.each, lengths, strict=True)):
             own = state[7 * k : 7 * k + 7]

@@ -10,6 +10,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, EventStatus
 
+from makebreak.gap.budget import go_on
 from makebreak.gap.simulation.commands import NO_COMMANDS, CommandPorts, Commands
 from makebreak.gap.simulation.initial_state import initial_state, twist_transmissions
 from makebreak.gap.simulation.scene_channels import SceneChannels
@@ -30,6 +31,7 @@ from makebreak.models.scene import CHANNEL_STEPS, InitialSection, Scene, read_sc
 from makebreak.systems.numerics.filters import Stage
 
 FREE_STEPS = 2000  # Of a continuous run, before short steps end it.
+STEPS_BETWEEN = 200  # Before it is asked again whether to go on.
 
 
 @dataclass
@@ -173,6 +175,7 @@ class SceneSimulation:
             where the time that a sample shows is before the window.
         Raises: ValueError for an unknown channel, joint, body or command.
         """
+        go_on()
         times = np.asarray(times, dtype=float)
         start = float(times[0] if start_sec is None else start_sec)
         for channel in channels:
@@ -322,6 +325,7 @@ class SceneSimulation:
     def _advance(self, time: float) -> bool:
         """Whether the simulation got there: parameters that a search tries may be too
         much for the integrator or the contact solver."""
+        go_on()
         try:
             if time > self._context.get_time():
                 self._simulator.AdvanceTo(time)
@@ -332,6 +336,8 @@ class SceneSimulation:
     def _watch(self, context: Context) -> EventStatus:
         """After each step of a continuous plant."""
         self._steps += 1
+        if self._steps % STEPS_BETWEEN == 0:
+            go_on()
         if self._steps > FREE_STEPS:
             done = context.get_time() - self._clock
             if done < self._config.least_step_sec * self._steps:
