@@ -105,12 +105,15 @@ class NamedEffect:
 @dataclass(frozen=True)
 class InUnits:
     """Rms error of a channel, or of a joint's equation, before and after, in its own
-    unit. noise: standard deviation of a sample, as used."""
+    unit. noise: standard deviation of a sample, as used. expected: what a perfect model
+    would leave, of noise and of how uncertain the windows' starts are; of an equation
+    this is its noise."""
 
     unit: str
     before: float
     after: float
     noise: float
+    expected: float = float("nan")
 
 
 @dataclass(frozen=True)
@@ -240,6 +243,9 @@ class Series:
     after: np.ndarray  # (n,) Simulated with the effects added.
     starts: np.ndarray
     noise: float
+    # (n,) What a perfect model would leave, as a standard deviation: of noise and of
+    # how uncertain a window's start is. None: the noise alone.
+    expected: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)

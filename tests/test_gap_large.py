@@ -26,11 +26,10 @@ from makebreak.gap.result import GapMeasure
 from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.search.screen import rank
 from makebreak.gap.simulation.contact_shapes import ContactShapes
-from makebreak.gap.simulation.free_bodies import moved_on_smooth
 from makebreak.gap.simulation.free_windows import settled
 from makebreak.gap.verdict import after_simulation
 from makebreak.models.effects.kind import Effect
-from makebreak.models.scene import InitialSection, load_scene, read_scene
+from makebreak.models.scene import load_scene, read_scene
 from makebreak.scripts.cli import main
 
 EYE = np.eye(3)[None]
@@ -490,22 +489,3 @@ def test_a_tenth_of_a_millimetre_is_no_gap_of_what_rolls(bowl):
     left = model.base() - r - 1e-4 * nuisances.columns[:, k + 1]
     assert float(np.sum(left**2)) < 0.05 * float(np.sum((model.base() - r) ** 2))
     assert nuisances.names[k + 1] == "shape of what is rolled on"
-
-
-def test_the_report_shows_what_rolls_as_it_was_judged(bowl, tmp_path):
-    folder, model = bowl
-    scene = read_scene(folder / "scene.yaml")
-    times, body = np.linspace(0.0, 1.0, 11), model.free_bodies.each[0]
-    w = model.windows[0]
-    at, v = settled(body, w.state[4:, 0], w.state[4:, 1], w.state[4:, 2])
-    start = [1.0, 0.0, 0.0, 0.0, *at, 0.0, 0.0, 0.0, *v]
-    said = InitialSection(
-        poses={"ball.ball": start[:7]}, body_velocities={"ball.ball": start[7:]}
-    )
-    found = moved_on_smooth(load_scene(scene, DiagramBuilder()), said, times)
-    expected = simulate(body, start, times)
-    np.testing.assert_allclose(found["ball.ball"], expected[:, :7], atol=1e-12)
-    assert np.ptp(found["ball.ball"][:, 6]) > 0.01
-    large_scenes.write("over_the_table", "", 6, tmp_path, most=1)
-    other = load_scene(read_scene(tmp_path / "scene.yaml"), DiagramBuilder())
-    assert moved_on_smooth(other, said, times) is None

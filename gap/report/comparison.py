@@ -1,8 +1,12 @@
-"""compare.html: what was measured and both models, moving, in one page."""
+"""compare.html: what was measured and both models, moving, in one page.
 
+What moves are the windows of the report (GapResult.series): nothing is simulated here.
+"""
+
+import json
 import logging
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,27 +25,17 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import Context, DiagramBuilder
 
-from makebreak.gap.data.recording import Episode, Recording
+from makebreak.gap.data.recording import Recording
 from makebreak.gap.report.clock import zero_of
+from makebreak.gap.report.summary import plain
 from makebreak.gap.result import GapResult, Series
-from makebreak.gap.simulation.commands import Commands
-from makebreak.gap.simulation.free_bodies import moved_on_smooth
-from makebreak.gap.simulation.scene_simulation import SceneSimulation
-from makebreak.models.effects.kind import full_name, one_dof_joints
-from makebreak.models.scene import (
-    InitialSection,
-    LoadedScene,
-    Scene,
-    initial_for,
-    load_scene,
-)
-from makebreak.systems.numerics.smoother import smooth_filtered
+from makebreak.models.effects.kind import full_name, one_dof_joints, sliding_joints
+from makebreak.models.scene import LoadedScene, Scene, initial_for, load_scene
 
-_LEAST_SEC = 1.5  # Of motion; a window alone is too short for the eye.
-_WHOLE_SEC = 3.0  # An episode that is no longer is shown from its start.
-_SHOWN_SEC = 4.0  # What is shorter is slowed down to last so long.
-_FRAMES = 120
-_SMOOTHED_SEC = 0.25  # On either side of the start.
+_WINDOW_SEC = 1.0  # What is shorter is slowed down to last so long, on average.
+_HELD_SEC = 0.4  # At a window's end, where models are farthest from what was measured.
+_JUMP_SEC = 1e-3  # From there to the start of the next one.
+_FRAMES = 360
 _QUATERNION = ("qw", "qx", "qy", "qz")
 _COLOURS = {
     "measured": Rgba(0.62, 0.66, 0.72, 0.45),
@@ -49,125 +43,147 @@ _COLOURS = {
     "after": Rgba(0.17, 0.42, 0.69, 0.9),
 }
 _STILL = Rgba(0.82, 0.82, 0.80, 1.0)
+_SAYS = {"before": "the given model", "after": "with the named effects"}
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Joint positions and free bodies' poses, a row a frame; NaN where unknown.
+    """Coordinates in the windows that are shown, a row a sample.
 
-    columns: {`<model>.<joint>.position` or `<model>.<body>.qw`, ...: (n,)}.
+    time (n,) [s]; starts: rows at which a window begins; columns: {"measured",
+    "before", "after": {`<model>.<joint>.position`, `<model>.<body>.qw`, ...: (n,)}},
+    NaN where not known; led: joints whose measured motion was prescribed. left_out:
+    windows that a model could not be simulated through.
     """
 
-    time: np.ndarray  # (n,) [s]
-    columns: Mapping[str, np.ndarray]
+    recording: str
+    episode: int
+    time: np.ndarray
+    starts: np.ndarray
+    columns: Mapping[str, Mapping[str, np.ndarray]]
+    led: Sequence[str]
+    left_out: int
 
 
 def comparison_html(
     result: GapResult, scene: Scene, recordings: Sequence[Recording]
 ) -> str | None:
-    """The page: measured as a ghost, the scene as it came, and with the effects.
+    """The page: measured as a ghost, the scene as it came, and with the effects, in the
+    windows of the report, with their error as a number.
 
-    Shown is a stretch that holds the worst held-out window, simulated in one go from
-    the measured state at its start.
-
-    Returns: None if there is nothing to show, or no place for Drake's viewer.
+    Returns: None if no motion was simulated, or there is no place for Drake's viewer.
     """
-    found = _stretch(result, recordings)
-    if found is None:
+    own = load_scene(scene, DiagramBuilder())
+    motion = shown_motion(result, own.plant, recordings)
+    if motion is None:
         return None
-    recording, episode, start, end = found
-    said = initial_for(scene, str(recording.path), episode.number)
+    path = {r.name: str(r.path) for r in recordings}.get(motion.recording, "")
+    said = initial_for(scene, path, motion.episode)
     scene = replace(scene, initial=said, initial_of={})
-    repaired = replace(scene, effects=[*scene.effects, *result.scene_effects()])
-    scenes = {"before": scene} | ({"after": repaired} if result.effects else {})
-    times = np.linspace(start, end, _FRAMES)
-    loaded = {name: load_scene(s, DiagramBuilder()) for name, s in scenes.items()}
-    names = _position_channels(loaded["before"].plant)
-    measured = _measured(recording, episode, times, names)
-    if not any(np.isfinite(v).any() for v in measured.columns.values()):
-        return None
-    initial = measured_state(recording, episode, start, loaded["before"].plant)
-    motions = {
-        name: _rolled(loaded[name], initial, times)
-        or _simulated(s, recording, episode, initial, times, names)
-        for name, s in scenes.items()
-    }
-    best = motions.get("after", motions["before"])
-    filled = {
-        name: np.where(np.isfinite(value), value, best.columns[name])
-        for name, value in measured.columns.items()
-    }
-    loaded = {"measured": loaded.get("after", loaded["before"])} | loaded
-    motions = {"measured": Motion(times, filled)} | motions
+    loaded = {"before": load_scene(scene, DiagramBuilder())}
+    if result.effects:
+        effects = [*scene.effects, *result.effects_in(motion.recording)]
+        repaired = replace(scene, effects=effects)
+        loaded["after"] = load_scene(repaired, DiagramBuilder())
     meshcat = _quiet_meshcat()
     if meshcat is None:
         return None
-    slow = max(1.0, _SHOWN_SEC / (end - start))
-    _draw(meshcat, loaded, motions, slow)
-    page = meshcat.StaticHtml()
-    zero = zero_of(float(recording.time[0]))
-    where = f"{start - zero:.2f} - {end - zero:.2f} s of {recording.name}, "
-    where += f"episode {episode.number}"
-    return _with_legend(page, list(scenes), where, slow)
+    rows, play, slow = _frames(motion)
+    drawn = {**loaded, "measured": loaded.get("after", loaded["before"])}
+    _draw(meshcat, drawn, motion, rows, play)
+    zeros = {r.name: zero_of(float(r.time[0])) for r in recordings}
+    zero = zeros.get(motion.recording, 0.0)
+    sliding = sliding_joints(own.plant)
+    errors = {who: errors_of(motion, who, sliding) for who in loaded}
+    return _with_numbers(meshcat.StaticHtml(), motion, errors, rows, play, zero, slow)
 
 
-def measured_state(
-    recording: Recording, episode: Episode, time: float, plant: MultibodyPlant
-) -> InitialSection:
-    """The measured state at a time, smoothed; what is not measured is left out."""
-    initial = InitialSection()
-    for joint in one_dof_joints(plant):
-        name = full_name(plant, joint)
-        found = _value_and_rate(recording, episode, f"{name}.position", time)
-        if found is not None:
-            initial.positions[name] = found[0]
-            initial.velocities[name] = found[1]
-    for index in plant.GetFloatingBaseBodies():
-        name = full_name(plant, plant.get_body(index))
-        xyz = [_value_and_rate(recording, episode, f"{name}.{a}", time) for a in "xyz"]
-        if f"{name}.z" not in recording:  # A camera from above sees no height.
-            at = plant.get_body(index).floating_positions_start() + 6
-            xyz[2] = (float(plant.GetPositions(plant.CreateDefaultContext())[at]), 0.0)
-        if any(each is None for each in xyz):
-            continue
-        p = [each[0] for each in xyz if each is not None]
-        v = [each[1] for each in xyz if each is not None]
-        q, w = _turning(recording, episode, name, time)
-        initial.poses[name] = [*q, *p]
-        initial.body_velocities[name] = [*w, *v]
-    return initial
-
-
-def _stretch(
-    result: GapResult, recordings: Sequence[Recording]
-) -> tuple[Recording, Episode, float, float] | None:
-    """The recording, its episode and the times from and to which it is shown."""
-    worst: tuple[float, Series | None, float] = (-1.0, None, 0.0)
+def shown_motion(
+    result: GapResult, plant: MultibodyPlant, recordings: Sequence[Recording]
+) -> Motion | None:
+    """The coordinates of a plant in the report's windows, of the recording whose
+    windows are farthest off; None where no coordinate was simulated."""
+    wanted = _position_channels(plant)
+    groups: dict[tuple[str, int], list[Series]] = {}
     for each in result.series:
-        cuts = [0, *sorted({int(s) for s in each.starts if s > 0}), len(each.time)]
-        error = (each.measured - each.before) / max(each.noise, 1e-300)
-        for a, b in zip(cuts[:-1], cuts[1:], strict=True):
-            part = error[a:b][np.isfinite(error[a:b])]
-            size = float(np.mean(part**2)) if part.size else -1.0
-            if size > worst[0]:
-                worst = (size, each, float(each.time[a]))
-    _, series, start = worst
-    if series is None:
+        if each.channel in wanted:
+            groups.setdefault((each.recording, each.episode), []).append(each)
+    if not groups or result.gap.window_s <= 0.0:
         return None
-    for recording in recordings:
-        for episode in recording.episodes:
-            time = recording.time[episode.rows]
-            if (recording.name, episode.number) != (series.recording, series.episode):
-                continue
-            if not time[0] <= start < time[-1]:
-                continue
-            first, last = float(time[0]), float(time[-1])
-            if last - first <= _WHOLE_SEC:
-                return recording, episode, first, last
-            length = max(_LEAST_SEC, 2.0 * result.gap.window_s)
-            start = max(min(start, last - length), first)
-            return recording, episode, start, min(start + length, last)
-    return None
+    some = max(groups.values(), key=lambda g: max(map(_off, g)))
+    first = some[0]
+    n = len(first.time)
+    cuts = [0, *sorted({int(s) for s in first.starts if 0 < s < n}), n]
+    kept: list[np.ndarray] = []
+    starts, left_out = [], 0
+    for a, b in zip(cuts[:-1], cuts[1:], strict=True):
+        both = [y[a:b] for each in some for y in (each.before, each.after)]
+        if any(np.isinf(y).any() or not np.isfinite(y).any() for y in both):
+            left_out += 1
+            continue
+        starts.append(sum(len(rows) for rows in kept))
+        kept.append(np.arange(a, b))
+    if not kept:
+        return None
+    rows = np.concatenate(kept)
+    time = first.time[rows]
+    columns: dict[str, dict[str, np.ndarray]] = {w: {} for w in _COLOURS}
+    for each in some:
+        for who, of in columns.items():
+            of[each.channel] = getattr(each, who)[rows]
+    led = []
+    for name in wanted:
+        if name not in columns["measured"]:
+            value = _measured(recordings, first, name, time)
+            if np.isfinite(value).any():
+                led.append(name)
+                for of in columns.values():
+                    of[name] = value
+    joints = [
+        name.removesuffix(".position") for name in led if name[-9:] == ".position"
+    ]
+    return Motion(
+        first.recording, first.episode, time, np.array(starts), columns, joints,
+        left_out,
+    )  # fmt: skip
+
+
+def errors_of(
+    motion: Motion, who: str, sliding: Collection[str] = ()
+) -> dict[str, tuple[str, np.ndarray]]:
+    """{joint, `<body> place` or `<body> turn`: (unit, (n,) size of measured minus
+    simulated)} of a model; NaN where nothing was measured. sliding: joints in metres.
+    """
+    seen, simulated = motion.columns["measured"], motion.columns[who]
+    led = {f"{joint}.position" for joint in motion.led}
+    off = {c: seen[c] - simulated[c] for c in simulated if c not in led}
+    found = {}
+    for at in dict.fromkeys(c.rsplit(".", 1)[0] for c in off):
+        if f"{at}.position" in off:
+            unit = "m" if at in sliding else "rad"
+            found[at] = unit, np.abs(off[f"{at}.position"])
+            continue
+        place = [off[f"{at}.{a}"] for a in "xyz" if f"{at}.{a}" in off]
+        if place:
+            found[f"{at} place"] = "m", np.linalg.norm(place, axis=0)
+        if all(f"{at}.{c}" in off for c in _QUATERNION):
+            q, p = (
+                np.stack([of[f"{at}.{c}"] for c in _QUATERNION])
+                for of in (seen, simulated)
+            )
+            q, p = (x / np.linalg.norm(x, axis=0) for x in (q, p))
+            apart = np.minimum(
+                np.linalg.norm(q - p, axis=0), np.linalg.norm(q + p, axis=0)
+            )
+            found[f"{at} turn"] = "rad", 4.0 * np.arcsin(np.minimum(0.5 * apart, 1.0))
+    return {k: e for k, e in found.items() if np.isfinite(e[1]).any()}
+
+
+def _off(each: Series) -> float:
+    """Rms error before, over the noise of a sample."""
+    error = (each.measured - each.before) / max(each.noise, 1e-300)
+    good = error[np.isfinite(error)]
+    return float(np.sqrt(np.mean(good**2))) if good.size else -1.0
 
 
 def _position_channels(plant: MultibodyPlant) -> list[str]:
@@ -183,88 +199,34 @@ def _position_channels(plant: MultibodyPlant) -> list[str]:
 
 
 def _measured(
-    recording: Recording, episode: Episode, times: np.ndarray, names: Sequence[str]
-) -> Motion:
-    columns = {}
-    for name in names:
-        columns[name] = np.full(len(times), np.nan)
-        if name in recording:
-            t, value = recording.samples(name, episode)
-            if len(t):
-                columns[name] = np.interp(times, t, value)
-    return Motion(times, columns)
+    recordings: Sequence[Recording], like: Series, name: str, time: np.ndarray
+) -> np.ndarray:
+    for recording in recordings:
+        for episode in recording.episodes:
+            same = (recording.name, episode.number) == (like.recording, like.episode)
+            if same and name in recording:
+                t, value = recording.samples(name, episode)
+                if len(t):
+                    return np.interp(time, t, value)
+    return np.full(len(time), np.nan)
 
 
-def _rolled(
-    loaded: LoadedScene, initial: InitialSection, times: np.ndarray
-) -> Motion | None:
-    """Of free bodies on a smooth surface that plates stand for, as they were judged:
-    Drake's knock at the edges. None: there is no such surface."""
-    poses = moved_on_smooth(loaded, initial, times)
-    if poses is None:
-        return None
-    columns = {
-        f"{name}.{c}": pose[:, k]
-        for name, pose in poses.items()
-        for k, c in enumerate((*_QUATERNION, *"xyz"))
-    }
-    return Motion(times, columns)
-
-
-def _simulated(scene, recording, episode, initial, times, names) -> Motion:
-    rows = episode.rows
-    columns = {c.name: c.values[rows] for c in recording.commands()}
-    commands = Commands(recording.time[rows], columns)
-    simulation = SceneSimulation(scene)
-    for body in initial.poses:
-        if f"{body}.z" not in recording:
-            initial = simulation.put_down(initial, body)
-    values = simulation.run(initial, times, names, commands)
-    for column in values.T:  # Before a delayed channel shows anything; after a failure.
-        good = np.isfinite(column)
-        if good.any() and not good.all():
-            known = np.flatnonzero(good)
-            column[:] = np.interp(np.arange(len(column)), known, column[good])
-    return Motion(times, dict(zip(names, values.T, strict=True)))
-
-
-def _value_and_rate(
-    recording: Recording, episode: Episode, channel: str, time: float
-) -> tuple[float, float] | None:
-    if channel not in recording:
-        return None
-    t, value = recording.samples(channel, episode)
-    near = np.flatnonzero(np.abs(t - time) <= _SMOOTHED_SEC)
-    if len(near) < 8:  # Slow sensors: as many as it takes.
-        near = np.sort(np.argsort(np.abs(t - time))[:8])
-    t, value = t[near], value[near]
-    if len(t) < 6:
-        return None
-    at = np.unique(np.append(t, time))
-    samples = np.full(len(at), np.nan)
-    samples[np.searchsorted(at, t)] = value
-    own = recording.channels[channel]
-    found = smooth_filtered(at, samples, max(own.noise, 1e-12), own.stages or ())
-    k = int(np.searchsorted(at, time))
-    return float(found.x[k, 0]), float(found.x[k, 1])
-
-
-def _turning(recording, episode, name, time) -> tuple[list[float], list[float]]:
-    """Orientation [qw qx qy qz] and angular velocity, world axes [rad/s]."""
-    found = [_value_and_rate(recording, episode, f"{name}.{c}", time)
-             for c in _QUATERNION]  # fmt: skip
-    if any(each is None for each in found):
-        return [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
-    q = np.array([each[0] for each in found if each is not None])
-    rate = np.array([each[1] for each in found if each is not None])
-    size = np.linalg.norm(q)
-    if size < 0.5:  # The signs of neighbouring samples differ.
-        return [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
-    q, rate = q / size, rate / size
-    rate -= (rate @ q) * q
-    # w = 2 dq/dt conj(q).
-    w = 2.0 * (-rate[0] * q[1:] + q[0] * rate[1:] - np.cross(rate[1:], q[1:]))
-    return q.tolist(), w.tolist()
+def _frames(motion: Motion) -> tuple[np.ndarray, np.ndarray, float]:
+    """(m,) rows, (m,) when each is shown [s], and how many times slower than it was:
+    a window after the other, each held at its end."""
+    ends = [*motion.starts[1:], len(motion.time)]
+    spans = list(zip(motion.starts, ends, strict=True))
+    seconds = sum(motion.time[b - 1] - motion.time[a] for a, b in spans)
+    slow = max(1.0, _WINDOW_SEC * len(spans) / max(seconds, 1e-9))
+    most = max(_FRAMES // len(spans), 2)
+    rows, play, now = [], [], 0.0
+    for a, b in spans:
+        mine = np.unique(np.linspace(a, b - 1, min(most, b - a)).round().astype(int))
+        at = now + slow * (motion.time[mine] - motion.time[a])
+        rows += [*mine, b - 1]
+        play += [*at, at[-1] + _HELD_SEC]
+        now = play[-1] + _JUMP_SEC
+    return np.array(rows), np.array(play), slow
 
 
 # ----- Drawing
@@ -285,15 +247,17 @@ def _quiet_meshcat() -> Meshcat | None:
 def _draw(
     meshcat: Meshcat,
     loaded: Mapping[str, LoadedScene],
-    motions: Mapping[str, Motion],
-    slow: float,
+    motion: Motion,
+    rows: np.ndarray,
+    play: np.ndarray,
 ) -> None:
-    start = next(iter(motions.values())).time[0]
+    """Args: loaded: who is shown, what was measured last. rows (m,), play (m,): as of
+    _frames."""
     meshcat.SetProperty("/Background", "visible", False)
     meshcat.SetProperty("/Axes", "visible", False)
     meshcat.SetProperty("/Grid", "visible", False)  # From below it hides what moves.
     meshcat.StartRecording(
-        frames_per_second=_FRAMES / _SHOWN_SEC, set_visualizations_while_recording=False
+        frames_per_second=1.0 / _JUMP_SEC, set_visualizations_while_recording=False
     )
     seen: list[np.ndarray] = []
     for who, one in loaded.items():
@@ -306,11 +270,14 @@ def _draw(
             _put(meshcat, f"/{who}/{path}", shape, _COLOURS[who], pose)
         plant, context = one.plant, one.plant.CreateDefaultContext()
         bodies = {path.split("/")[0]: body for path, body, _, _ in moving}
-        for row, now in enumerate(motions[who].time):
-            _set_positions(plant, context, motions[who].columns, row)
+        columns = {
+            name: _known(value, motion) for name, value in motion.columns[who].items()
+        }
+        for row, now in zip(rows, play, strict=True):
+            _set_positions(plant, context, columns, row)
             for path, body in bodies.items():
                 X_WB = plant.EvalBodyPoseInWorld(context, body)
-                meshcat.SetTransform(f"/{who}/{path}", X_WB, (now - start) * slow)
+                meshcat.SetTransform(f"/{who}/{path}", X_WB, float(now))
                 if who == "measured":
                     seen += [
                         X_WB @ pose.translation()
@@ -405,6 +372,17 @@ def _sticks(plant: MultibodyPlant, context: Context) -> list:
     return found
 
 
+def _known(value: np.ndarray, motion: Motion) -> np.ndarray:
+    """(n,) with a line between what is known in a window: slow sensors have few rows,
+    and before a delayed channel shows anything it stands still."""
+    out = np.array(value)
+    for a, b in zip(motion.starts, [*motion.starts[1:], len(out)], strict=True):
+        good = np.flatnonzero(np.isfinite(out[a:b]))
+        if len(good):
+            out[a:b] = np.interp(np.arange(b - a), good, out[a:b][good])
+    return out
+
+
 def _set_positions(plant, context, columns: Mapping[str, np.ndarray], row: int):
     q = plant.GetPositions(context)
     for joint in one_dof_joints(plant):
@@ -414,12 +392,13 @@ def _set_positions(plant, context, columns: Mapping[str, np.ndarray], row: int):
     for index in plant.GetFloatingBaseBodies():
         body = plant.get_body(index)
         name, at = full_name(plant, body), body.floating_positions_start()
-        turn = np.array([columns[f"{name}.{c}"][row] for c in _QUATERNION])
+        unknown = np.full(row + 1, np.nan)
+        turn = np.array([columns.get(f"{name}.{c}", unknown)[row] for c in _QUATERNION])
         if np.isfinite(turn).all() and np.linalg.norm(turn) > 1e-3:
             q[at : at + 4] = Quaternion(turn / np.linalg.norm(turn)).wxyz()
-        place = np.array([columns[f"{name}.{a}"][row] for a in "xyz"])
-        if np.isfinite(place).all():
-            q[at + 4 : at + 7] = place
+        for k, a in enumerate("xyz"):
+            if np.isfinite(value := columns.get(f"{name}.{a}", unknown)[row]):
+                q[at + 4 + k] = value
     plant.SetPositions(context, q)
 
 
@@ -427,21 +406,116 @@ def _path(name: str) -> str:
     return re.sub(r"[^\w]", "_", name)
 
 
-def _with_legend(page: str, models: Sequence[str], where: str, slow: float) -> str:
-    says = {"before": "the given model", "after": "with the named effects"}
+def _with_numbers(
+    page: str,
+    motion: Motion,
+    errors: Mapping[str, Mapping[str, tuple[str, np.ndarray]]],
+    rows: np.ndarray,
+    play: np.ndarray,
+    zero: float,
+    slow: float,
+) -> str:
+    """The page with a legend, and with the error of each model as it is at the time
+    that the player shows."""
 
     def dot(who: str) -> str:
         c = _COLOURS[who]
         rgb = ",".join(str(round(255 * x)) for x in (c.r(), c.g(), c.b()))
         return f'<span style="color:rgb({rgb})">&#9679;</span>'
 
+    n = len(motion.starts)
+    start, end = motion.time[0] - zero, motion.time[-1] - zero
     lines = [f"{dot('measured')} measured"]
-    lines += [f"{dot(who)} {who}: {says[who]}" for who in models]
+    lines += [
+        f"{dot(who)} {who}: {_SAYS[who]}<br>&emsp;error <b id=error_{who}></b>; "
+        f"rms over all that is shown {_rms(of)}"
+        for who, of in errors.items()
+    ]
     pace = "" if slow == 1.0 else f", at {1.0 / slow:.2g} times real time"
-    lines.append(f"{where}{pace}. All start from the measured state.")
+    lines.append("<span id=shown_time></span>")
+    lines.append(
+        f"{start:.2f} - {end:.2f} s of {motion.recording}, episode {motion.episode}"
+        f"{pace}: the report's windows of held-out data. Each model starts again from "
+        f"the measured state {'once' if n == 1 else f'{n} times'}."
+    )
+    if motion.led:
+        lines.append(f"Prescribed as measured: {', '.join(motion.led)}.")
+    if motion.left_out:
+        lines.append(
+            f"Left out: {motion.left_out} that could not be simulated to their end."
+        )
+    window = np.searchsorted(motion.starts, rows, "right")
+    since = motion.time[rows] - motion.time[motion.starts[window - 1]]
+    says = {
+        f"error_{who}": [_largest(of, motion, row) for row in rows]
+        for who, of in errors.items()
+    }
+    says["shown_time"] = [
+        f"{motion.time[row] - zero:.3f} s: {ago:.3f} s after start {k} of {n}"
+        for row, k, ago in zip(rows, window, since, strict=True)
+    ]
+    order = [*errors, "measured"]  # As they are drawn: what was measured last.
+    script = _SCRIPT % {
+        "play": json.dumps([round(float(t), 6) for t in play]),
+        "says": json.dumps(says),
+        "order": json.dumps(order),
+    }
     box = (
         '<div style="position:fixed;left:14px;top:12px;z-index:10;padding:8px 12px;'
-        "font:14px/1.5 system-ui,sans-serif;background:rgba(255,255,255,.88);"
+        "max-width:46em;font:14px/1.5 system-ui,sans-serif;"
+        "font-variant-numeric:tabular-nums;background:rgba(255,255,255,.88);"
         f'border-radius:4px">{"<br>".join(lines)}</div>'
     )
-    return page.replace("</body>", f"{box}</body>", 1)
+    return page.replace("</body>", f"{box}<script>{script}</script></body>", 1)
+
+
+# At one place surfaces of several models would flicker through each other: each is
+# moved a little towards the eye before the one that is drawn before it.
+_SCRIPT = """
+const shown = {play: %(play)s, says: %(says)s, order: %(order)s};
+function show() {
+  const now = viewer.animator.time + 1e-6;
+  let k = shown.play.length - 1;
+  while (k > 0 && shown.play[k] > now) k -= 1;
+  for (const [id, texts] of Object.entries(shown.says))
+    document.getElementById(id).textContent = texts[k];
+  shown.order.forEach((who, place) => {
+    viewer.scene_tree.find([who]).object.traverse((each) => {
+      each.renderOrder = place + 1;
+      for (const m of each.material ? [each.material].flat() : []) {
+        m.polygonOffset = true;
+        m.polygonOffsetFactor = m.polygonOffsetUnits = -2 * place;
+      }
+    });
+  });
+  requestAnimationFrame(show);
+}
+show();
+"""
+
+
+def _largest(of: Mapping[str, tuple[str, np.ndarray]], motion: Motion, row: int) -> str:
+    """The largest error of each unit at a row, or at the last one before it in its
+    window at which it was measured."""
+    first = motion.starts[np.searchsorted(motion.starts, row, "right") - 1]
+    best: dict[str, tuple[float, str]] = {}
+    for name, (unit, error) in of.items():
+        past = error[first : row + 1]
+        past = past[np.isfinite(past)]
+        if past.size and past[-1] >= best.get(unit, (-1.0, ""))[0]:
+            best[unit] = float(past[-1]), name
+    return (
+        ", ".join(
+            f"{plain(size, unit)} ({name})" for unit, (size, name) in best.items()
+        )
+        or "-"
+    )
+
+
+def _rms(of: Mapping[str, tuple[str, np.ndarray]]) -> str:
+    """Of each unit, of the joint or body that is farthest off."""
+    best: dict[str, float] = {}
+    for unit, error in of.values():
+        size = float(np.sqrt(np.nanmean(error**2)))
+        best[unit] = max(size, best.get(unit, 0.0))
+    return ", ".join(plain(size, unit) for unit, size in best.items())

@@ -80,7 +80,9 @@ def _pictures(shown: GapResult, recordings: Sequence[Recording]) -> dict[str, by
     figures = {
         "channels": picture_of_channels(shown) if shown.gap.per_channel else None,
         "where": picture_of_where(shown, extents_of(recordings)),
-        "series": picture_of_series(shown.series),
+        "series": picture_of_series(
+            shown.series, {c: u.unit for c, u in shown.gap.in_units.items()}
+        ),
         "trust": picture_of_trust(shown),
     }
     return {name: _png(each) for name, each in figures.items() if each is not None}

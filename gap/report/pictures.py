@@ -28,7 +28,7 @@ def worst_channels(result: GapResult, most: int = _MOST_CHANNELS) -> list[str]:
 
 
 def picture_of_channels(result: GapResult) -> Figure:
-    """Held-out error of each channel, before and after, in units of its noise."""
+    """Held-out error of each channel, before and after, over the expected error."""
     names = worst_channels(result)
     per_channel = result.gap.per_channel
     figure = Figure(
@@ -51,11 +51,11 @@ def picture_of_channels(result: GapResult) -> Figure:
     axes.set_xlim(min([0.5, *(0.7 * v for v in values if v > 0.0)]), 2.2 * top)
     axes.set_xscale("log")
     if np.isfinite(floor) and floor > 0.0:
-        axes.axvline(floor, color="0.2", lw=1.2, ls="--", label="noise floor")
+        axes.axvline(floor, color="0.2", lw=1.2, ls="--", label="expected")
     _plain_numbers(axes.xaxis)
     axes.set_yticks(rows, names, fontsize=9)
     axes.invert_yaxis()
-    axes.set_xlabel("held-out error / noise (1: noise only)", fontsize=9)
+    axes.set_xlabel("held-out error / expected error", fontsize=9)
     axes.legend(
         fontsize=8, frameon=False, ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0)
     )
@@ -114,7 +114,7 @@ def picture_of_where(
     axes.set_yticks(np.arange(len(names)), names, fontsize=9)
     _time_ticks(axes, spans, starts, bins)
     bar = figure.colorbar(shown, ax=axes, pad=0.01)
-    bar.set_label("error / noise", fontsize=9)
+    bar.set_label("error / expected error", fontsize=9)
     _plain_numbers(bar.ax.yaxis)
     return figure
 
@@ -162,9 +162,13 @@ def _time_ticks(axes, spans, starts, bins) -> None:
             )  # fmt: skip
 
 
-def picture_of_series(series: Sequence[Series], most: int = 3) -> Figure | None:
-    """Channels over neighbouring held-out windows: measured, before and after."""
-    worst = sorted(series, key=lambda each: -_rms_before(each))[:most]
+def picture_of_series(
+    series: Sequence[Series], units: Mapping[str, str] | None = None, most: int = 3
+) -> Figure | None:
+    """Measured channels over neighbouring held-out windows: measured, before and after,
+    and the errors beside what a perfect model would leave. units: of channels."""
+    measured = [each for each in series if np.isfinite(each.measured).any()]
+    worst = sorted(measured, key=lambda each: -_rms_before(each))[:most]
     worst = [_stretch(each) for each in worst]
     if not worst:
         return None
@@ -181,17 +185,25 @@ def picture_of_series(series: Sequence[Series], most: int = 3) -> Figure | None:
             left.plot(gapped_t, gapped, color=colour, lw=1.3, label=label)
             # Between rows of a channel others may have rows: no break of the line.
             rows = np.flatnonzero(np.isfinite(each.measured))
-            error = (each.measured - value)[rows] / max(each.noise, 1e-300)
+            error = (each.measured - value)[rows]
             starts = np.searchsorted(rows, each.starts)
             gapped_t, gapped = _broken(t[rows], error, starts)
             right.plot(gapped_t, gapped, color=colour, lw=1.0, label=label)
-        right.axhspan(-2.0, 2.0, color="0.88", lw=0)
+        expected = _expected(each)
+        band_t, band = _broken(t, 2.0 * expected, each.starts)
+        right.fill_between(band_t, -band, band, color="0.88", lw=0)
+        right.axhspan(-2.0 * each.noise, 2.0 * each.noise, color="0.72", lw=0)
         left.set_title(
             f"{each.channel}   ({each.recording}, episode {each.episode})",
             fontsize=9, loc="left",
         )  # fmt: skip
-        right.set_title("(measured - simulated) / noise; grey: 2 sigma", fontsize=9)
-        right.set_yscale("symlog", linthresh=10.0)
+        unit = (units or {}).get(each.channel, "")
+        right.set_title(
+            f"measured - simulated{f' [{unit}]' if unit else ''}; grey (2 sigma): "
+            "expected, dark: noise",
+            fontsize=9,
+        )
+        right.set_yscale("symlog", linthresh=max(float(np.max(expected)), 1e-12))
         _plain_numbers(right.yaxis)
         for axes in (left, right):
             _plain(axes)
@@ -217,8 +229,16 @@ def _stretch(each: Series) -> Series:
     parts = (each.time, each.measured, each.before, each.after)
     time, measured, before, after = (part[a:b] for part in parts)
     return replace(
-        each, time=time, measured=measured, before=before, after=after, starts=starts
-    )
+        each, time=time, measured=measured, before=before, after=after, starts=starts,
+        expected=_expected(each)[a:b],
+    )  # fmt: skip
+
+
+def _expected(each: Series) -> np.ndarray:
+    """(n,) of a series, the noise where nothing else is known."""
+    if each.expected is None:
+        return np.full(len(each.time), each.noise)
+    return np.asarray(each.expected)
 
 
 def picture_of_trust(result: GapResult) -> Figure | None:

@@ -111,3 +111,9 @@ def number(value: float | None, digits: int = 3) -> str:
     if value is None or not np.isfinite(value):
         return "-"
     return f"{value:.{digits}g}"
+
+
+def plain(size: float, unit: str) -> str:
+    """A size in a unit that its numbers are short in: 1.2 mrad, 0.31 m, 43 N m."""
+    small = unit in ("rad", "m", "rad/s", "m/s") and abs(size) < 0.1
+    return f"{number(1e3 * size)} m{unit}" if small else f"{number(size)} {unit}"

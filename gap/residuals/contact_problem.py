@@ -47,7 +47,7 @@ from makebreak.gap.simulation.contact_windows import (
     varies,
 )
 from makebreak.gap.simulation.face_supports import LiesOn
-from makebreak.gap.simulation.measure import gap_measure, series_of
+from makebreak.gap.simulation.measure import gap_measure, series_of, unseen_series
 from makebreak.gap.thresholds import AGREEMENT_RMS_MAX
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, sliding_joints
@@ -655,7 +655,10 @@ class ContactProblem(ContactCandidates, GapProblem):
             gap = replace(gap, in_equations=found[0], equations=found[1])
         return Outcome(
             gap,
-            series_of(model, before, after, held),
+            [
+                *series_of(model, before, after, held),
+                *unseen_series(model, effects, held),
+            ],
             unexplained_in_windows(model, after),
         )
 

@@ -22,7 +22,7 @@ from makebreak.gap.residuals.touch import TouchModel, touch_candidates
 from makebreak.gap.residuals.where import where_in_windows
 from makebreak.gap.result import Unexplained, Where
 from makebreak.gap.simulation.free_windows import FreeBodyModel, touched
-from makebreak.gap.simulation.measure import gap_measure, series_of
+from makebreak.gap.simulation.measure import gap_measure, series_of, unseen_series
 from makebreak.gap.simulation.windows import WindowModel
 from makebreak.models.effects.contact import STIFFNESS
 from makebreak.models.scene import Scene
@@ -117,9 +117,12 @@ class WindowedProblem(GapProblem):
         if not any(held):
             return None
         before, after = model.simulate(()), model.simulate(effects)
+        series = series_of(model, before, after, held)
+        if isinstance(model, WindowModel):
+            series += unseen_series(model, effects, held)
         return Outcome(
             gap_measure(model, before, after, held),
-            series_of(model, before, after, held),
+            series,
             unexplained_in_windows(model, after),
         )
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from makebreak.gap.does_not_fit import DoesNotFit
-from makebreak.gap.numerics.free_body import FreeBodies, alone, simulate_all
+from makebreak.gap.numerics.free_body import FreeBodies, alone
 from makebreak.gap.simulation.free_body import (
     AT_CORNERS,
     CHANGES,
@@ -24,7 +24,7 @@ from makebreak.gap.simulation.free_body import (
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.contact import DAMPER
 from makebreak.models.effects.kind import Effect, find_pair, full_name
-from makebreak.models.scene import InitialSection, LoadedScene, Scene
+from makebreak.models.scene import LoadedScene, Scene
 
 
 class FreeBodiesScene:
@@ -188,28 +188,3 @@ class FreeBodiesScene:
             raise ValueError(f"{kind} of two bodies that are free")
         pair = replace(second, other=first.own)
         CHANGES[kind](pair, p, np.ones(len(first.own), bool))
-
-
-def moved_on_smooth(
-    loaded: LoadedScene, initial: InitialSection, times: np.ndarray
-) -> dict[str, np.ndarray] | None:
-    """{body: (n, 7) quaternion wxyz and place} of a scene in which plates stand for a
-    smooth surface; None of any other.
-
-    Args: initial: poses and velocities of all free bodies. times (n,): the first is
-        that of the start.
-    """
-    try:
-        scene = FreeBodiesScene(loaded.scene, (), loaded)
-    except DoesNotFit:
-        return None
-    bodies = scene.bodies()
-    if not any(len(one.smooth.of) for one in scene.each):
-        return None
-    if not set(scene.names) <= set(initial.poses):
-        return None
-    start = [
-        [*initial.poses[name], *initial.body_velocities[name]] for name in scene.names
-    ]
-    x = simulate_all(bodies, start, times)
-    return {name: x[:, k, :7] for k, name in enumerate(scene.names)}

@@ -8,14 +8,15 @@ import numpy as np
 from makebreak.gap.data.recording import Recording, unit_of
 from makebreak.gap.problem import rms
 from makebreak.gap.result import GapMeasure, InUnits, Series
-from makebreak.gap.simulation.windows import seen_in
+from makebreak.gap.simulation.windows import WindowModel, seen_in
 from makebreak.models.dynamics import SceneDynamics
-from makebreak.models.effects.kind import sliding_joints
+from makebreak.models.effects.kind import Effect, sliding_joints
 
 WINDOW_SEC = 0.3
 # What a perfect model would leave: an error is divided by what the channel's noise and
 # the uncertainty of its window's start give together.
 NOISE_FLOOR = 1.0
+MOST_SHOWN = 12  # Windows of a series.
 
 
 class Windows(Protocol):
@@ -56,6 +57,7 @@ def gap_measure(model: Windows, before, after, held: Sequence[bool]) -> GapMeasu
     def rms_of(e: np.ndarray, c) -> float:
         return rms(e[:, c][both[:, c]])
 
+    stds_of_whole = of_whole(stds)
     everything = slice(None)
     sliding = sliding_joints(model.dynamics.plant)
     recordings = model.recordings
@@ -70,6 +72,7 @@ def gap_measure(model: Windows, before, after, held: Sequence[bool]) -> GapMeasu
             name: InUnits(
                 unit_of(name.rsplit(".", 1)[1], name.rsplit(".", 1)[0] in sliding),
                 rms_of(plain[0], c), rms_of(plain[1], c), float(model.noise[c]),
+                rms_of(stds_of_whole, c),
             )
             for c, name in enumerate(model.channels)
         },
@@ -82,29 +85,53 @@ def gap_measure(model: Windows, before, after, held: Sequence[bool]) -> GapMeasu
 
 
 def series_of(
-    model: Windows, before, after, held: Sequence[bool], most: int = 12
+    model: Windows, before, after, held: Sequence[bool], most: int = MOST_SHOWN
 ) -> list[Series]:
     """The channels over the first windows that count."""
-    rows = np.flatnonzero(held)
+    same = _shown(model, held, most)
+    first = model.windows[same[0]]
+    recording = model.recordings[first.recording]
+    time = np.concatenate([recording.time[model.windows[k].rows] for k in same])
+    starts = np.cumsum([0, *(len(before[k]) for k in same[:-1])])
+    expected = np.concatenate([model.windows[k].std for k in same])
+    out = []
+    for c, channel in enumerate(model.channels):
+        seen = np.full(len(time), np.nan)
+        if channel in recording:
+            rows = [model.windows[k].rows for k in same]
+            seen = np.concatenate([recording[channel][r] for r in rows])
+        out.append(
+            Series(
+                channel, recording.name, first.episode, time, seen,
+                np.concatenate([before[k][:, c] for k in same]),
+                np.concatenate([after[k][:, c] for k in same]),
+                starts, float(model.noise[c]), expected[:, c],
+            )
+        )  # fmt: skip
+    return out
+
+
+def unseen_series(
+    model: WindowModel, effects: Sequence[Effect], held: Sequence[bool]
+) -> list[Series]:
+    """The same of coordinates that were not measured, without and with effects: for
+    pictures of the motion."""
+    other = model.of_unmeasured()
+    if other is None:
+        return []
+    some = set(_shown(model, held))
+    chosen = [k in some for k in range(len(model.windows))]
+    before, after = (other.simulate(each, chosen) for each in ((), effects))
+    return series_of(other, before, after, chosen)
+
+
+def _shown(model: Windows, held: Sequence[bool], most: int = MOST_SHOWN) -> list[int]:
+    """Numbers of the windows that series are of: of one episode."""
+    rows = [int(k) for k in np.flatnonzero(held)]
     first = model.windows[rows[0]]
     same = [
         k for k in rows
         if (model.windows[k].recording, model.windows[k].episode)
         == (first.recording, first.episode)
-    ][:most]  # fmt: skip
-    recording = model.recordings[first.recording]
-    time = np.concatenate([recording.time[model.windows[k].rows] for k in same])
-    lengths = [len(before[k]) for k in same]
-    starts = np.cumsum([0, *lengths[:-1]])
-    out = []
-    for c, channel in enumerate(model.channels):
-        seen = [recording[channel][model.windows[k].rows] for k in same]
-        out.append(
-            Series(
-                channel, recording.name, first.episode, time, np.concatenate(seen),
-                np.concatenate([before[k][:, c] for k in same]),
-                np.concatenate([after[k][:, c] for k in same]),
-                starts, float(model.noise[c]),
-            )
-        )  # fmt: skip
-    return out
+    ]  # fmt: skip
+    return same[:most]

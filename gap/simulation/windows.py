@@ -6,6 +6,7 @@ by their block of time before anything is fitted.
 """
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -213,6 +214,22 @@ class WindowModel(WindowedResidual):
         """By how much later than their rows commands act from now on [s]."""
         self.commands_late = seconds
         self._commands, self._base = {}, None
+
+    def of_unmeasured(self) -> "WindowModel | None":
+        """The same windows, which simulate the coordinates that were not measured; None
+        where all were."""
+        other, plant = copy(self), self.dynamics.plant
+        names = [f"{full_name(plant, j)}.position" for j in one_dof_joints(plant)]
+        for i in sorted(plant.GetFloatingBaseBodies()):
+            body = full_name(plant, plant.get_body(i))
+            names += [f"{body}.{axis}" for axis in (*TURN, *_POSITIONS)]
+        other.channels = [
+            c for c in names if not any(c in r for r in self.recordings)
+        ]  # fmt: skip
+        n = len(other.channels)
+        other.noise, other._filters = np.ones(n), [{} for _ in self.recordings]
+        other.windows = [replace(w, std=np.ones((len(w.std), n))) for w in self.windows]
+        return other if n else None
 
     # ----- Cutting
 

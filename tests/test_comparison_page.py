@@ -1,0 +1,220 @@
+"""compare.html moves as the report's windows do, and its numbers are theirs."""
+
+import base64
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from effect_scenes import double, on_ground, pendulum
+from pydrake.systems.framework import DiagramBuilder
+
+from makebreak.gap.data.reading import read_recordings
+from makebreak.gap.data.table import write_recording
+from makebreak.gap.report.comparison import comparison_html, errors_of, shown_motion
+from makebreak.gap.residuals.objects import FlightProblem
+from makebreak.gap.result import GapResult
+from makebreak.gap.simulation.commands import Commands
+from makebreak.gap.simulation.measure import gap_measure, series_of, unseen_series
+from makebreak.gap.simulation.scene_simulation import SceneSimulation
+from makebreak.gap.simulation.windows import WindowModel
+from makebreak.models.effects.kind import Effect
+from makebreak.models.scene import InitialSection, load_scene
+from makebreak.models.scene_schema import ActuationSection
+
+COULOMB = Effect("joint_coulomb_friction", ["p.j1"], {"coulomb": 0.35})
+TIME = np.arange(300) * 0.01
+SWING = 0.5 * np.sin(3.0 * TIME)
+EFFORT = ActuationSection("effort", ["p.j1"])
+PUSHED = 2.5 * np.sin(3.0 * TIME)
+# {kind of input: (drives, the channel that is recorded, its values)}
+INPUTS = {
+    "effort command": (EFFORT, "effort_command", PUSHED),
+    "effort measured": (EFFORT, "effort_measured", PUSHED),
+    "pd": (
+        ActuationSection("pd", ["p.j1"], kp=[20.0], kd=[1.0]),
+        "position_command",
+        SWING,
+    ),
+    "servo": (
+        ActuationSection("servo", ["p.j1"], kp=[20.0], kd=[1.0]),
+        "position_command",
+        SWING,
+    ),
+    "velocity": (
+        ActuationSection("velocity", ["p.j1"], kd=[3.0]),
+        "velocity_command",
+        3.0 * SWING,
+    ),
+    "undriven": (ActuationSection("none"), "", None),
+}
+
+
+def result_of(model, effects, scene) -> GapResult:
+    """What a run shows of windows that were simulated without and with effects."""
+    held = [True] * len(model.windows)
+    before, after = model.simulate(()), model.simulate(effects)
+    series = series_of(model, before, after, held)
+    if isinstance(model, WindowModel):
+        series += unseen_series(model, effects, held)
+    gap = gap_measure(model, before, after, held)
+    return GapResult("gap_named", "", [], [], gap, [], {}, [], series)
+
+
+def recorded(folder, columns):
+    write_recording(folder / "run.csv", {"time": TIME} | columns)
+    return read_recordings([folder / "run.csv"])
+
+
+def swung(folder, what):
+    """A pendulum with friction that its scene lacks, driven by one kind of input."""
+    drive, channel, told = INPUTS[what]
+    scene = replace(pendulum(folder), actuation=drive)
+    given = channel.replace("effort_measured", "effort_command")
+    inputs = {} if told is None else {f"p.j1.{given}": told}
+    world = SceneSimulation(replace(scene, effects=[COULOMB]))
+    start = InitialSection({"p.j1": 0.4}, {"p.j1": 2.0})
+    y = world.run(start, TIME, ["p.j1.position"], Commands(TIME, inputs))[:, 0]
+    rng = np.random.default_rng(0)
+    columns = {"p.j1.position": y + 1e-4 * rng.normal(size=len(y))}
+    columns |= {} if told is None else {f"p.j1.{channel}": told}
+    return scene, recorded(folder, columns)
+
+
+@pytest.mark.parametrize("what", INPUTS)
+def test_a_driven_joint_moves_as_with_its_input(tmp_path, what):
+    """With what its scene lacked it goes where it was measured, at each window's end;
+    without, it does not. An effort that is measured is a line between its rows and not
+    held: it is off by half a row."""
+    scene, recordings = swung(tmp_path, what)
+    model = WindowModel(scene, recordings, 0.3)
+    result = result_of(model, [COULOMB], scene)
+    plant = load_scene(scene, DiagramBuilder()).plant
+    motion = shown_motion(result, plant, recordings)
+    [(unit, after)] = errors_of(motion, "after").values()
+    [(_, before)] = errors_of(motion, "before").values()
+    assert unit == "rad"
+    allowed = 1e-2 if what == "effort measured" else 3e-3
+    assert after.max() < allowed
+    assert before.max() > 5.0 * allowed
+    # As in the report's table, where all windows are in it.
+    if len(model.windows) == len(motion.starts):
+        table = result.gap.in_units["p.j1.position"]
+        assert np.sqrt(np.mean(after**2)) == pytest.approx(table.after)
+        assert np.sqrt(np.mean(before**2)) == pytest.approx(table.before)
+
+
+def tossed(folder, names="xyz", height=0.6):
+    """A ball in free flight: what it does is known in closed form."""
+    scene = on_ground(folder, "ball")
+    time = TIME[:30]
+    p = {
+        "x": 0.5 * time,
+        "y": -0.2 * time,
+        "z": height + 2.0 * time - 0.5 * 9.81 * time**2,
+    }
+    rng = np.random.default_rng(0)
+    columns = {"time": time} | {
+        f"b.ball.{a}": p[a] + 1e-4 * rng.normal(size=len(time)) for a in names
+    }
+    write_recording(folder / "run.csv", columns)
+    return scene, read_recordings([folder / "run.csv"])
+
+
+def test_a_free_body_falls_as_in_its_windows(tmp_path):
+    scene, recordings = tossed(tmp_path)
+    problem = FlightProblem(scene, recordings)
+    result = result_of(problem, [], scene)
+    plant = load_scene(scene, DiagramBuilder()).plant
+    motion = shown_motion(result, plant, recordings)
+    time = motion.time
+    fall = 0.6 + 2.0 * time - 0.5 * 9.81 * time**2
+    np.testing.assert_allclose(motion.columns["before"]["b.ball.z"], fall, atol=2e-3)
+    errors = errors_of(motion, "before")
+    assert errors["b.ball place"][0] == "m"
+    assert errors["b.ball place"][1].max() < 2e-3
+
+
+def test_a_coordinate_that_is_not_measured_is_as_it_was_simulated(tmp_path):
+    """A camera from above: the ball rolls on the ground, at the height of its radius,
+    and is not drawn where the scene has it by default."""
+    scene, _ = tossed(tmp_path)
+    columns = {"time": TIME, "b.ball.x": 0.1 * TIME, "b.ball.y": 0.0 * TIME}
+    rng = np.random.default_rng(0)
+    for name in ("b.ball.x", "b.ball.y"):
+        columns[name] = columns[name] + 1e-4 * rng.normal(size=len(TIME))
+    write_recording(tmp_path / "run.csv", columns)
+    recordings = read_recordings([tmp_path / "run.csv"])
+    model = WindowModel(scene, recordings, 0.3, most=3)
+    motion = shown_motion(
+        result_of(model, [], scene), load_scene(scene, DiagramBuilder()).plant,
+        recordings,
+    )  # fmt: skip
+    z = motion.columns["before"]["b.ball.z"]
+    assert np.isfinite(z).all() and np.ptp(z) < 1e-3
+    assert "b.ball.z" not in motion.led
+    assert 0.0 < z[0] < 0.2
+
+
+def test_a_joint_that_windows_lead_is_drawn_as_measured_and_said(tmp_path):
+    """Problems of contact lead joints along what was measured: they are no series."""
+    scene = double(tmp_path)
+    names = ["d.j1.position", "d.j2.position"]
+    scene = replace(scene, actuation=ActuationSection("none"))
+    start = InitialSection({"d.j1": 0.4, "d.j2": -0.3})
+    y = SceneSimulation(scene).run(start, TIME, names)
+    recordings = recorded(tmp_path, dict(zip(names, y.T, strict=True)))
+    result = result_of(WindowModel(scene, recordings, 0.3), [], scene)
+    result = replace(result, series=[s for s in result.series if s.channel == names[1]])
+    plant = load_scene(scene, DiagramBuilder()).plant
+    motion = shown_motion(result, plant, recordings)
+    assert motion.led == ["d.j1"]
+    for who in ("measured", "before", "after"):
+        expected = np.interp(motion.time, TIME, y[:, 0])
+        np.testing.assert_allclose(motion.columns[who][names[0]], expected, atol=1e-12)
+    assert list(errors_of(motion, "before")) == ["d.j2"]
+    page = comparison_html(result, scene, recordings)
+    assert "Prescribed as measured: d.j1." in page
+
+
+def test_what_a_window_could_not_be_simulated_through_is_left_out_and_said(tmp_path):
+    scene, recordings = swung(tmp_path, "effort command")
+    result = result_of(WindowModel(scene, recordings, 0.3), [COULOMB], scene)
+    [series] = result.series
+    before = np.array(series.before)
+    a, b = series.starts[1:3]
+    before[a + 3 : b] = np.inf
+    result = replace(result, series=[replace(series, before=before)])
+    plant = load_scene(scene, DiagramBuilder()).plant
+    motion = shown_motion(result, plant, recordings)
+    assert motion.left_out == 1 and len(motion.starts) == len(series.starts) - 1
+    assert not set(series.time[a + 1 : b - 1]) & set(motion.time)
+    page = comparison_html(result, scene, recordings)
+    assert "Left out: 1 that could not be simulated to their end." in page
+    assert "inf" not in re.search(r"says: (\{.*?\]\}), order", page).group(1)
+
+
+def test_the_page_says_the_error_of_each_frame_and_draws_the_measured_last(tmp_path):
+    scene, recordings = swung(tmp_path, "effort measured")
+    result = result_of(WindowModel(scene, recordings, 0.3), [COULOMB], scene)
+    page = comparison_html(result, scene, recordings)
+    [(play, says, order)] = re.findall(
+        r"play: (\[.*?\]), says: (\{.*?\]\}), order: (\[.*?\])", page
+    )
+    assert json.loads(order)[-1] == "measured"
+    play, says = np.array(json.loads(play)), json.loads(says)
+    assert (np.diff(play) > 0.0).all()
+    [series] = result.series
+    off = np.abs(series.measured - series.before)
+    for text, error in zip(says["shown_time"], says["error_before"], strict=True):
+        first = series.starts[int(re.search(r"start (\d+) of", text).group(1)) - 1]
+        late = np.abs(series.time[first:] - float(text.split(" s")[0]))
+        row = first + np.argmin(late)
+        value, unit = re.match(r"([\d.e-]+) (m?rad) \(p.j1\)", error).groups()
+        shown = float(value) * (1e-3 if unit == "mrad" else 1.0)
+        assert shown == pytest.approx(off[row], rel=6e-3)
+    # What moves: the animation's frames hold the simulated angle at that time.
+    parts = re.findall(r"base64,([A-Za-z0-9+/=]+)", page)
+    blob = b"".join(base64.b64decode(each) for each in parts)
+    assert blob.find(b"/before/") < blob.find(b"/measured/")
