@@ -54,13 +54,14 @@ class Evidence:
     """Held-out error without and with an effect, all others being in the model.
 
     runner_up: the best other explanation, "kind at place". margin: its held-out error
-    over that of the effect, less one.
+    over that of the effect, less one. why: it was not chosen, beside its error.
     """
 
     held_out_before: float
     held_out_after: float
     runner_up: str
     margin: float
+    why: str = ""
 
 
 @dataclass(frozen=True)
@@ -303,8 +304,8 @@ class GapResult:
                 "after": _number(self.gap.after),
                 "noise_floor": _number(self.gap.noise_floor),
                 "reduction": _number(self.gap.reduction),
-                "metric": "rms over held-out windows of (measured - simulated)/noise; "
-                "the noise of a sample and of its window's start",
+                "metric": "rms over held-out windows of (measured - simulated)/"
+                "expected; expected: what noise and uncertain starts leave",
                 "window_s": _number(self.gap.window_s),
                 "held_out": self.gap.data == "reported" and self.gap.seconds > 0.0,
                 "data": self.gap.data,
@@ -369,6 +370,7 @@ def _effect_json(each: NamedEffect) -> dict[str, Any]:
             "held_out_after": _number(each.evidence.held_out_after),
             "runner_up": each.evidence.runner_up,
             "margin": _number(each.evidence.margin),
+            "why": each.evidence.why,
         },
         "identifiable": each.identifiable,
         "indistinguishable_from": [_of(e) for e in each.indistinguishable_from],

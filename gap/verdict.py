@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from math import isnan
+from math import isfinite, isnan
 
 from pydrake.multibody.plant import MultibodyPlant
 
@@ -31,6 +31,34 @@ OF_CHANNEL = "(unit of the channel)"
 def figure(x: float, digits: int = 3) -> str:
     """So many digits of x, in full: 3700 and not 3.7e+03."""
     return f"{float(f'{x:.{digits}g}'):g}"
+
+
+def plain(size: float, unit: str) -> str:
+    """A size in a unit that its number is short in: 1.2 mrad, 0.31 m, 43 N m."""
+    if not isfinite(size):
+        return "-"
+    small = unit in ("rad", "m", "rad/s", "m/s") and abs(size) < 0.1
+    return f"{figure(1e3 * size)} m{unit}" if small else f"{figure(size)} {unit}"
+
+
+def in_plain_units(gap: GapMeasure) -> str:
+    """In brackets, the error of the channel that is farthest off, in its own unit,
+    beside what a perfect model would leave; nothing where that is not known."""
+    known = {
+        name: each for name, each in gap.in_units.items()
+        if isfinite(each.expected + each.before) and name in gap.per_channel
+    }  # fmt: skip
+    if not known:
+        return ""
+    name = max(known, key=lambda n: gap.per_channel[n]["before"])
+    e = known[name]
+    goes = plain(e.before, e.unit)
+    if e.after != e.before and isfinite(e.after):
+        goes = f"from {goes} to {plain(e.after, e.unit)}"
+    return (
+        f" ({name}: {goes}; expected from noise and uncertain start: "
+        f"{plain(e.expected, e.unit)})"
+    )
 
 
 def verdict_of(
@@ -78,7 +106,7 @@ def why_not_confirmed(verdict: str, gap: GapMeasure) -> str:
     return (
         " The data used for the decision show no error beyond noise, but on the data "
         f"held out for the report the simulation error is {figure(gap.before, 2)} "
-        "times the noise."
+        f"times the expected error{in_plain_units(gap)}."
     )
 
 
@@ -127,7 +155,7 @@ def two_figures(
         goes = f"is {figure(start)}"
         if end < start:
             goes = f"falls from {figure(start)} to {figure(end)}"
-        return f" {where} the error {goes} times the noise."
+        return f" {where} the error {goes} times the expected error."
     one, other = (share_left(*each) for each in ((start, end), (gap.before, gap.after)))
     # Of next to nothing, half and twice are the same.
     if 0.5 <= max(one, 0.1) / max(other, 0.1) <= 2.0:
@@ -185,7 +213,9 @@ def named(choice: Choice, plant: MultibodyPlant, beside: str = "") -> NamedEffec
         tuple(choice.effect.at),
         parameters,
         says[:1].upper() + says[1:] + ".",
-        Evidence(choice.before, choice.after, choice.runner_up, choice.margin),
+        Evidence(
+            choice.before, choice.after, choice.runner_up, choice.margin, choice.why
+        ),
         choice.ties,
         apart if tied else "",
         "weak" if weak else "identifiable",
@@ -207,29 +237,32 @@ def says(
     if verdict == "no_gap":
         return (
             "The scene and the recordings agree to within noise and tolerance "
-            f"(held-out error {figure(gap.before, 2)} times the noise).{more}"
+            f"(held-out error {figure(gap.before, 2)} times the expected error"
+            f"{in_plain_units(gap).replace(' (', '; ').replace(')', '')}).{more}"
         )
     if verdict == "not_judged":
         return (
             "The channels that were compared agree (held-out error "
-            f"{figure(gap.before, 2)} times the noise), but not every measured channel "
-            f"was compared, so the scene is not confirmed.{more} "
+            f"{figure(gap.before, 2)} times the expected error), but not every "
+            f"measured channel was compared, so the scene is not confirmed.{more} "
             "To leave a channel out, write `columns: {name: null}` in the recording's "
             "sidecar."
         )
     words = " ".join(each.says for each in effects)
     if verdict == "gap_unnamed":
         head = f"{words} Beyond that, " if words else ""
-        error = f"{after} times the noise"
+        error = f"{after} times the expected error"
         if shows_in_equations_alone(gap) and left > gap.after:
             places = "the equations of motion", "simulated windows"
             if not by_equations:
                 places = "the data for selection", "those for the report"
-            error = f"{figure(left)} times the noise in {places[0]}, "
+            error = f"{figure(left)} times the expected error in {places[0]}, "
             error += f"{after} in {places[1]}"
         if words and gap.before > AGREEMENT_RMS_MAX:
             error += f" ({before} without what is named)"
         tried = "tried so far" if present().undone else "of the catalogue"
+        if not shows_in_equations_alone(gap):
+            error += in_plain_units(gap)
         return head + (
             f"{'a' if head else 'A'} gap remains that no effect {tried} explains: "
             f"held-out error {error}.{more}"
@@ -240,7 +273,7 @@ def says(
     goes = "falls" if gap.after < gap.before else "goes"
     return (
         f"{words}{tail} The held-out error {goes} from {before} to {after} times the "
-        f"noise.{more}"
+        f"expected error{in_plain_units(gap)}.{more}"
     )
 
 

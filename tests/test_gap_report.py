@@ -225,7 +225,10 @@ def test_the_next_best_is_said_with_its_error():
         return next_best(Evidence(9.0, 1.0, "payload at p.rod", margin))
 
     assert words(0.62) == "payload at p.rod, error 62 % larger"
-    assert words(0.001) == words(-0.001) == "payload at p.rod, the same error"
+    said = "payload at p.rod, the same error: the data do not prefer it"
+    assert words(0.001) == words(-0.001) == said
+    known = Evidence(9.0, 1.0, "payload at p.rod", 0.0, "it needs 4 parameters")
+    assert next_best(known) == "payload at p.rod, the same error: it needs 4 parameters"
     assert words(-0.03).endswith(", error 3 % smaller: too little to prefer it")
     assert words(np.nan) == "payload at p.rod"
     assert next_best(Evidence(9.0, 1.0, "", np.nan)) == ""
@@ -317,7 +320,8 @@ def test_no_gap_and_no_name_are_said_and_nothing_is_added(case, tmp_path):
     text = text_of(written(case, tmp_path / "left", unnamed))
     assert "none is named" in text
     assert (
-        "near q = 0.3: 12.3 times the noise; correlates with position of p.j1" in text
+        "near q = 0.3: 12.3 times the expected error; correlates with position of p.j1"
+        in text
     )
 
 

@@ -137,7 +137,7 @@ def test_the_sentence_has_the_figures_of_what_was_held_out():
     gap = GapMeasure(0.9, 0.8, 1.0, 0.6, in_equations=(9.0, 1.1))
     said = two_figures(12.0, 0.7, gap)
     assert said.endswith("held out for the report the error falls from 9 to 1.1 times "
-                         "the noise.")  # fmt: skip
+                         "the expected error.")  # fmt: skip
     # Nothing went there where the effect acts.
     said = two_figures(12.0, 0.7, replace(gap, in_equations=(1.0, 1.0)))
     assert "held out" not in said and "from 12 to 0.7" in said

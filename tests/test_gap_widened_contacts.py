@@ -124,7 +124,7 @@ def test_slots_are_turned_and_moved_by_what_is_said(problem):
 
 def test_a_gap_of_equations_alone_is_said_with_its_size():
     gap = GapMeasure(0.8, 0.8, 1.0, 0.5, {})
-    assert "error is 2.5 times the noise" in two_figures(2.5, 2.5, gap)
+    assert "error is 2.5 times the expected error" in two_figures(2.5, 2.5, gap)
 
 
 def test_a_scene_that_sap_lifts_gets_a_warning(problem, monkeypatch):

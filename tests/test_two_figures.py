@@ -50,24 +50,24 @@ def test_figures_more_than_a_factor_of_two_apart_are_said(start, end, gap, said)
 def test_a_gap_that_simulation_does_not_show_is_told_by_the_equations():
     said = two_figures(11.0, 0.934, measure(1.41, 0.83))
     assert "Simulated windows do not show this gap" in said
-    assert "from 11 to 0.934 times the noise" in said
+    assert "from 11 to 0.934 times the expected error" in said
     said = two_figures(11.0, 11.0, measure(1.2, 1.2))  # Nothing was named.
     assert "Simulated windows do not show this gap" in said
-    assert "error is 11 times the noise" in said
+    assert "error is 11 times the expected error" in said
 
 
 @pytest.mark.parametrize(
     ("gap", "left", "said"),
     [
-        (measure(12.0, 6.0), 9.0, "error 6 times the noise."),
+        (measure(12.0, 6.0), 9.0, "error 6 times the expected error."),
         (
             measure(1.1, 1.0),
             70.0,
-            "error 70 times the noise in the equations of motion, "
+            "error 70 times the expected error in the equations of motion, "
             "1 in simulated windows.",
         ),
-        (measure(12.0, 6.0, 0.0), 9.0, "error 6 times the noise."),
-        (measure(1.1, 1.0), 0.9, "error 1 times the noise."),
+        (measure(12.0, 6.0, 0.0), 9.0, "error 6 times the expected error."),
+        (measure(1.1, 1.0), 0.9, "error 1 times the expected error."),
     ],
 )
 def test_a_gap_without_a_name_has_the_figure_that_shows_it(gap, left, said):
@@ -79,7 +79,10 @@ def test_what_is_left_beside_what_is_named_has_both_figures():
     effect = NamedEffect("payload", ("a.b",), {}, "It carries 2 kg.", None)  # type: ignore[arg-type]
     said = says("gap_unnamed", [effect], measure(30.8, 0.28), "", 1.6)
     assert "It carries 2 kg. Beyond that, a gap remains" in said
-    assert "1.6 times the noise in the equations of motion, 0.28 in simulated" in said
+    assert (
+        "1.6 times the expected error in the equations of motion, 0.28 in simulated"
+        in said
+    )
     assert said.endswith("(30.8 without what is named).")
 
 
@@ -87,11 +90,16 @@ def test_where_all_errors_are_of_windows_the_sentence_speaks_of_their_data():
     said = two_figures(11.0, 0.934, measure(1.41, 0.83), by_equations=False)
     assert "equations" not in said
     assert "held out for the report do not show this gap" in said
-    assert "selected on the error falls from 11 to 0.934 times the noise." in said
+    assert (
+        "selected on the error falls from 11 to 0.934 times the expected error." in said
+    )
     said = two_figures(41.0, 9.0, measure(41.0, 25.0), by_equations=False)
     assert "20% is left in the data that effects were selected on, 60% in" in said
     text = says("gap_unnamed", [], measure(1.1, 1.0), "", 70.0, by_equations=False)
-    assert "70 times the noise in the data for selection, 1 in those for the" in text
+    assert (
+        "70 times the expected error in the data for selection, 1 in those for the"
+        in text
+    )
 
 
 def test_which_problems_are_of_equations():

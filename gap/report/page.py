@@ -147,7 +147,7 @@ def _no_effect(result: GapResult) -> str:
 
 
 def _left(each: Unexplained) -> str:
-    text = f"{each.channel}, {each.region}: {each.size:.3g} times the noise"
+    text = f"{each.channel}, {each.region}: {each.size:.3g} times the expected error"
     return text + (
         f"; correlates with {each.correlates_with}" if each.correlates_with else ""
     )
@@ -157,7 +157,6 @@ def _numbers(result: GapResult) -> str:
     g = result.gap
     closed = closed_share(g.before, g.after, g.noise_floor)
     cells = [("before", number(g.before)), ("after", number(g.after))]
-    cells += [("noise floor", number(g.noise_floor))]
     if closed and result.effects:
         cells.append(("of the gap closed", closed))
     elif g.in_equations and result.effects:
@@ -177,6 +176,7 @@ def _numbers(result: GapResult) -> str:
             "not be simulated to their end and count in neither"
         )
     return (
-        f'<div class="numbers">{shown}</div><p class="small">Error over noise, rms '
-        f"over {windows_of(result)}{seen}.</p>"
+        f'<div class="numbers">{shown}</div><p class="small">Held-out error in units '
+        "of the expected error, which sensor noise and the uncertain start of a window "
+        f"leave with a perfect model; rms over {windows_of(result)}{seen}.</p>"
     )

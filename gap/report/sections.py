@@ -13,6 +13,7 @@ from makebreak.gap.report.clock import zeros_of
 from makebreak.gap.report.markup import cell, folded, image, section, table
 from makebreak.gap.report.summary import number, together, windows_of
 from makebreak.gap.result import GapResult, InUnits, Where
+from makebreak.gap.verdict import plain
 
 _SEVERITIES = ("error", "warning", "info")
 _MOST_TOLERANCES = 2.0  # Of a nuisance parameter: farther off, its model is doubtful.
@@ -38,13 +39,19 @@ def where(
         ]
         for (channel, region), found in groups.items()
     ]
-    heads = ["channel", "while", "in total", "largest error / noise", "where that is"]
+    heads = [
+        "channel",
+        "while",
+        "in total",
+        "largest error / expected",
+        "where that is",
+    ]
     clock = ""
     if any(zeros_of(recordings).values()):
         clock = " Times count from the start of a recording."
     note = (
         '<p class="small">Coloured: windows whose error is significantly larger than '
-        f"the noise. Grey: no significant error, or nothing was measured.{clock}</p>"
+        f"expected. Grey: no significant error, or nothing was measured.{clock}</p>"
     )
     picture = image(pictures, "where", "Where the disagreement stands out")
     return section("Where", picture + note + table(heads, rows, most=6))
@@ -84,7 +91,7 @@ def unexplained(result: GapResult) -> str:
         [u.channel, u.region, f"{u.size:.3g}", u.correlates_with]
         for u in sorted(result.unexplained, key=lambda u: -u.size)
     ]
-    heads = ["channel", "where", "error / noise", "correlates with"]
+    heads = ["channel", "where", "error / expected", "correlates with"]
     return section("Remaining error", table(heads, rows, most=6))
 
 
@@ -138,7 +145,11 @@ def in_units(result: GapResult) -> str:
     """Held-out errors as they are: not over noise, not clipped."""
     if not result.gap.in_units:
         return ""
-    body = f"<p>Rms over {windows_of(result)}.</p>" + _errors(result.gap.in_units)
+    body = (
+        f"<p>Rms over {windows_of(result)}. Expected: what noise and the uncertain "
+        "start of a window leave with a perfect model.</p>"
+        + _errors(result.gap.in_units)
+    )
     if result.gap.equations:
         body += (
             "<p>Residual of each equation of motion on the same data, with the "
@@ -149,11 +160,15 @@ def in_units(result: GapResult) -> str:
 
 
 def _errors(of: Mapping[str, InUnits]) -> str:
+    heads = ["channel", "before", "after", "expected", "noise of a sample"]
     rows = [
-        [name, e.unit, number(e.before), number(e.after), number(e.noise)]
+        [name, *(plain(x, e.unit) for x in (e.before, e.after, e.expected, e.noise))]
         for name, e in of.items()
     ]
-    return table(["channel", "unit", "before", "after", "noise"], rows, most=14)
+    if not any(np.isfinite(e.expected) for e in of.values()):  # Equations.
+        heads = [*heads[:3], "expected from noise"]
+        rows = [[*row[:3], row[4]] for row in rows]
+    return table(heads, rows, most=14)
 
 
 def trust(result: GapResult, pictures: Mapping[str, bytes]) -> str:

@@ -71,10 +71,14 @@ def next_best(evidence: Evidence) -> str:
         return evidence.runner_up
     percent = round(100.0 * abs(evidence.margin))
     if percent == 0:
-        return f"{evidence.runner_up}, the same error"
+        why = evidence.why or "the data do not prefer it"
+        return f"{evidence.runner_up}, the same error: {why}"
     if evidence.margin > 0.0:
         return f"{evidence.runner_up}, error {percent} % larger"
-    return f"{evidence.runner_up}, error {percent} % smaller: too little to prefer it"
+    why = f", and {evidence.why}" if evidence.why else ""
+    return (
+        f"{evidence.runner_up}, error {percent} % smaller: too little to prefer it{why}"
+    )
 
 
 def windows_of(result: GapResult) -> str:
@@ -111,9 +115,3 @@ def number(value: float | None, digits: int = 3) -> str:
     if value is None or not np.isfinite(value):
         return "-"
     return f"{value:.{digits}g}"
-
-
-def plain(size: float, unit: str) -> str:
-    """A size in a unit that its numbers are short in: 1.2 mrad, 0.31 m, 43 N m."""
-    small = unit in ("rad", "m", "rad/s", "m/s") and abs(size) < 0.1
-    return f"{number(1e3 * size)} m{unit}" if small else f"{number(size)} {unit}"

@@ -9,7 +9,13 @@ from makebreak.gap.fit import tangents
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Candidate, Fitted
 from makebreak.gap.result import Considered
-from makebreak.gap.search.choice import Choice, Trial, fixed_parameters, places
+from makebreak.gap.search.choice import (
+    Choice,
+    Trial,
+    fixed_parameters,
+    places,
+    why_not,
+)
 from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.search.groups import groups_of, with_pruned_groups
 from makebreak.gap.search.pairs import look_ahead, pair_instead
@@ -208,6 +214,7 @@ def _choices(
             len(new) > 1 and not is_group, needed_beside=tuple(
                 (e.kind, tuple(e.at)) for e in new if both_needed and e is not effect
             ),
+            why=why_not(runner.ranked.candidate, best.candidate) if runner else "",
         )
         for k, effect in enumerate(new)
     )  # fmt: skip

@@ -32,10 +32,10 @@ class Choice:
 
     std: standard deviations of its parameters. before, after: held-out error without
     and with it. runner_up, margin: the best other candidate, and by which share its
-    error was larger. ties: effects that explain the data as well. fixed: parameters
-    that a fit leaves at neutral. size: parameters that a fit chooses. in_group: one of
-    several places of its kind that were added at once. of_two: it and its rival are
-    both needed. paired: it was added at once with an effect of another kind. or_more:
+    error was larger; why it was not chosen, beside that. ties: effects that explain
+    the data as well. fixed: parameters that a fit leaves at neutral. size: parameters
+    that a fit chooses. in_group: one of several places of its kind that were added at
+    once. of_two: it and its rival are both needed. paired: it was added at once with an effect of another kind. or_more:
     parameters that may as well be any larger. needed_beside: (kind, place) of rivals
     beside which it is needed, so that they are no ties. sets: others that explain as
     much in the place of it and another one.
@@ -56,6 +56,7 @@ class Choice:
     or_more: tuple[str, ...] = ()
     needed_beside: tuple[tuple[str, tuple[str, ...]], ...] = ()
     sets: tuple[RivalSet, ...] = ()
+    why: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,6 +145,20 @@ def complexity(candidate: Candidate) -> int:
     whose parameters are left at neutral counts little less than all of it."""
     all_of_them = candidate.size + len(candidate.fixed)
     return 2 * all_of_them - bool(candidate.fixed)
+
+
+def why_not(other: Candidate, chosen: Candidate) -> str:
+    """Why one that leaves about as little as what is chosen is not chosen."""
+    theirs, ours = other.size, chosen.size
+    if theirs > ours:
+        return f"it has {theirs} parameters, the named one {ours}"
+    if theirs < ours:
+        return "there is more evidence for the named one"
+    if complexity(other) > complexity(chosen):
+        return "it is the more general law, and nothing shows more than the named one"
+    if other.kind == chosen.kind:
+        return "the data hardly tell the two places apart"
+    return "the data hardly tell the two apart"
 
 
 def is_possible(fit: Fitted, of: Ranked, first: int) -> bool:

@@ -90,7 +90,7 @@ def preferred_by_simulation(
         ):
             new = replace(
                 choice, effect=fit.effects[0], std=fit.std[0], after=fit.score,
-                runner_up=called(choice.effect),
+                runner_up=called(choice.effect), why="",
                 margin=choice.after / fit.score - 1.0, ties=(), fixed=(), size=1,
             )  # fmt: skip
             selection = replace(selection, choices=(new,), end=fit)

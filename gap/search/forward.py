@@ -218,7 +218,9 @@ def _better(search: Comparison, path: Path, steps: int, k: int, branch: Path) ->
     was = path.states[steps].chosen[k].effect
     runner_up, margin = f"{was.kind} at {', '.join(was.at)}", theirs / ours - 1.0
     chosen = [
-        replace(c, runner_up=runner_up, margin=margin) if _is_at(c.effect, tie) else c
+        replace(c, runner_up=runner_up, margin=margin, why="")
+        if _is_at(c.effect, tie)
+        else c
         for c in branch.end.chosen
     ]
     end = State(tuple(chosen), branch.end.fitted)

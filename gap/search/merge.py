@@ -31,7 +31,7 @@ def merge(
         of, old, other = trial.ranked.candidate, chosen[i].effect, chosen[j].effect
         new = replace(
             chosen[i], ties=(), fixed=of.fixed, size=of.size,
-            runner_up=f"{old.kind} and {other.kind} at {', '.join(old.at)}",
+            runner_up=f"{old.kind} and {other.kind} at {', '.join(old.at)}", why="",
             margin=search.error(current.score) / search.error(trial.fit.score) - 1.0,
         )  # fmt: skip
         chosen = [*chosen[:i], new, *chosen[i + 1 : j], *chosen[j + 1 :]]

@@ -94,7 +94,7 @@ def _in_their_place(
                 continue
             other = replace(
                 choice, effect=trial.fit.effects[k], ties=(), fixed=candidate.fixed,
-                size=candidate.size + 1, runner_up=called(choice.effect),
+                size=candidate.size + 1, runner_up=called(choice.effect), why="",
             )  # fmt: skip
             others = [*chosen[:k], other, *chosen[k + 1 :]]
             for each in _refining(other.effect):
