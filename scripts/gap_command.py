@@ -275,7 +275,7 @@ def effects_table(result: GapResult) -> Table:
     if isfinite(g.before):
         notes.append(
             f"held-out error: {g.before:.3g} before, {g.after:.3g} after, in units of "
-            f"the noise (rms over {windows_of(result)}; a perfect model leaves 1)"
+            f"the expected error (rms over {windows_of(result)}; a perfect model leaves 1)"
         )
     if g.in_equations:
         before, after = g.in_equations

@@ -35,8 +35,9 @@ class Choice:
     error was larger; why it was not chosen, beside that. ties: effects that explain
     the data as well. fixed: parameters that a fit leaves at neutral. size: parameters
     that a fit chooses. in_group: one of several places of its kind that were added at
-    once. of_two: it and its rival are both needed. paired: it was added at once with an effect of another kind. or_more:
-    parameters that may as well be any larger. needed_beside: (kind, place) of rivals
+    once. of_two: it and its rival are both needed. paired: it was added at once with an
+    effect of another kind. or_more: parameters that may as well be any larger.
+    needed_beside: (kind, place) of rivals
     beside which it is needed, so that they are no ties. sets: others that explain as
     much in the place of it and another one.
     """
