@@ -181,11 +181,13 @@ def _sweep(args) -> int:
 
 
 def _gap(args) -> int:
-    with CatchInterrupt() as interrupt:
-        return _gap_until(args, interrupt)
+    from makebreak.scripts.drake_log import DrakeLog
+
+    with CatchInterrupt() as interrupt, DrakeLog() as drake:
+        return _gap_until(args, interrupt, drake)
 
 
-def _gap_until(args, interrupt) -> int:
+def _gap_until(args, interrupt, drake) -> int:
     from makebreak.gap.data.bags import is_bag, is_dataset
     from makebreak.scripts.gap_command import effects_table, run_and_report
 
@@ -212,7 +214,7 @@ def _gap_until(args, interrupt) -> int:
         result, files, notes, is_interrupted = run_and_report(
             scene, recordings, out, number_of_processes(args.jobs), export, is_robot,
             args.skip_bad_rows, number(args.budget, "--budget", 0.0),
-            lambda: interrupt.hit,
+            lambda: interrupt.hit, drake,
         )  # fmt: skip
     except (Exception, SystemExit) as error:
         if on_purpose(error) or isinstance(error, OSError):
@@ -222,6 +224,7 @@ def _gap_until(args, interrupt) -> int:
     print(effects_table(result).to_text())
     for note in notes:
         print(note)
+    drake.show()
     print_files(files)
     return 130 if is_interrupted else 0
 

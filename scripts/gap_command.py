@@ -24,6 +24,7 @@ from makebreak.gap.result import GapResult
 from makebreak.models.scene import Scene, read_scene
 from makebreak.models.typed_yaml import read_yaml
 from makebreak.scripts.arguments import BUDGET_MIN
+from makebreak.scripts.drake_log import DrakeLog
 from makebreak.scripts.interrupts import undisturbed
 from makebreak.scripts.outputs import OutputFolder, print_files
 from makebreak.scripts.table import Table
@@ -100,6 +101,7 @@ def run_and_report(
     skip_bad_rows: bool = False,
     budget_min: float = BUDGET_MIN,
     interrupted: Callable[[], bool] = lambda: False,
+    drake: DrakeLog | None = None,
 ) -> tuple[GapResult, list[Path], list[str], bool]:
     """The workflow's result, the files written, notes for the user, and whether it was
     interrupted.
@@ -108,7 +110,8 @@ def run_and_report(
         is_robot: whether scene_path is a robot's own URDF or MJCF. Then a scene is
         proposed for it, with a sidecar for each recording that has none, and both are
         written too. budget_min: minutes after which the best answer so far is
-        written; interrupted: whether it is to be written as soon as possible.
+        written; interrupted: whether it is to be written as soon as possible. drake:
+        collects what Drake says; what changes the motion is told with the checks.
     Raises: ValueError for a scene, a recording or a folder that cannot be used.
     """
     start = perf_counter()
@@ -142,6 +145,9 @@ def run_and_report(
                     scene_path, recording_paths, jobs, progress, skip_bad_rows,
                     sidecars, doubts,
                 )  # fmt: skip
+                if drake is not None:
+                    said = drake.findings(recording_paths[0].stem)
+                    result = replace(result, checks=[*result.checks, *said])
                 progress("writing the report")
                 scene = read_scene(scene_path)
                 recordings = read_recordings(recording_paths, skip_bad_rows, sidecars)
@@ -275,7 +281,8 @@ def effects_table(result: GapResult) -> Table:
     if isfinite(g.before):
         notes.append(
             f"held-out error: {g.before:.3g} before, {g.after:.3g} after, in units of "
-            f"the expected error (rms over {windows_of(result)}; a perfect model leaves 1)"
+            f"the expected error (rms over {windows_of(result)}; a perfect model "
+            "leaves 1)"
         )
     if g.in_equations:
         before, after = g.in_equations
