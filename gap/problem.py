@@ -182,12 +182,14 @@ class Fitted:
 class Outcome:
     """What the decided effects are worth on some data, by simulation where there is
     one, and what is left. expects: what counts as noise in it beside that of sensors,
-    as sentences; "": nothing."""
+    as sentences; "": nothing. where: windows without the effects stand out, of data
+    that are reported on."""
 
     gap: GapMeasure
     series: Sequence[Series] = ()
     unexplained: Sequence[Unexplained] = ()
     expects: str = ""
+    where: Sequence[Where] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,12 +14,22 @@ VERDICTS = ("no_gap", "not_judged", "gap_named", "ambiguous", "gap_unnamed")
 AGREES = ("no_gap", "not_judged")
 
 
+def plain(size: float, unit: str) -> str:
+    """A size in a unit that its number is short in: 1.2 mrad, 0.31 m, 43 N m."""
+    if not np.isfinite(size):
+        return "-"
+    if unit in ("rad", "m", "rad/s", "m/s") and abs(size) < 0.1:
+        size, unit = 1e3 * size, f"m{unit}"
+    return f"{float(f'{size:.3g}'):g} {unit}"
+
+
 @dataclass(frozen=True)
 class Where:
     """A stretch in which a channel's disagreement stands out.
 
     region: what the mechanism did there, in words. score: rms of the residual in units
-    of what noise would give.
+    of what noise would give. held_out: it is in the part that is reported on, looked at
+    after all was decided.
     """
 
     channel: str
@@ -29,6 +39,7 @@ class Where:
     recording: str
     region: str
     score: float
+    held_out: bool = False
 
 
 @dataclass(frozen=True)
@@ -219,12 +230,14 @@ class GapMeasure:
 
 @dataclass(frozen=True)
 class Unexplained:
-    """What is left that no kind explains. size: rms in units of noise."""
+    """What is left that no kind explains. size: rms in units of noise. since: where it
+    goes with time, and jumps once, when that is [s]."""
 
     channel: str
     region: str
     size: float
     correlates_with: str
+    since: float | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from makebreak.gap.budget import present
 from makebreak.gap.data.recording import unit_of
 from makebreak.gap.problem import leaves_gap, share_left
-from makebreak.gap.result import Estimate, Evidence, GapMeasure, NamedEffect
+from makebreak.gap.result import Estimate, Evidence, GapMeasure, NamedEffect, plain
 from makebreak.gap.search.choice import Choice, Selection, called
 from makebreak.gap.thresholds import (
     AGREEMENT_RMS_MAX,
@@ -31,14 +31,6 @@ OF_CHANNEL = "(unit of the channel)"
 def figure(x: float, digits: int = 3) -> str:
     """So many digits of x, in full: 3700 and not 3.7e+03."""
     return f"{float(f'{x:.{digits}g}'):g}"
-
-
-def plain(size: float, unit: str) -> str:
-    """A size in a unit that its number is short in: 1.2 mrad, 0.31 m, 43 N m."""
-    if not isfinite(size):
-        return "-"
-    small = unit in ("rad", "m", "rad/s", "m/s") and abs(size) < 0.1
-    return f"{figure(1e3 * size)} m{unit}" if small else f"{figure(size)} {unit}"
 
 
 def in_plain_units(gap: GapMeasure) -> str:

@@ -49,6 +49,7 @@ from makebreak.gap.problem import (
     Outcome,
     share_left,
 )
+from makebreak.gap.report.clock import zero_of
 from makebreak.gap.report.summary import says_of
 from makebreak.gap.residuals.command_times import set_command_times
 from makebreak.gap.residuals.contact_problem import ContactProblem
@@ -67,7 +68,8 @@ from makebreak.gap.residuals.objects import (
 from makebreak.gap.residuals.pressing import PressingProblem, presses, push_each_other
 from makebreak.gap.residuals.sap_lift import sap_lift
 from makebreak.gap.residuals.tool_weight import as_used, check_tool_weight
-from makebreak.gap.result import AGREES, GapMeasure, GapResult, JudgedChannel
+from makebreak.gap.residuals.where import begins
+from makebreak.gap.result import AGREES, GapMeasure, GapResult, JudgedChannel, Where
 from makebreak.gap.search.choice import Choice, Selection
 from makebreak.gap.search.chosen_by_simulation import (
     kept_by_simulation,
@@ -487,6 +489,13 @@ def conclude(
         verdict = "ambiguous"
         near += turned
     near += drifting if selection.choices else ""
+    # Nothing was learned from it: the part that is reported on is looked at last.
+    where = [] if verdict in AGREES else [
+        *problem.where(selection.start.left),
+        *(replace(w, held_out=True) for w in final.where),
+    ]  # fmt: skip
+    if verdict == "gap_unnamed":
+        near += _since(where, final, [*problem.recordings, *reported])
     if verdict == "gap_unnamed":
         near += problem.hint(selection.end)
     else:
@@ -506,7 +515,7 @@ def conclude(
     return GapResult(
         verdict,
         says(verdict, effects, final.gap, near, left, problem.by_equations),
-        problem.where(selection.start.left) if verdict not in AGREES else [], effects,
+        where, effects,
         final.gap, final.unexplained if verdict == "gap_unnamed" else [],
         {n: float(b / p) for n, b, p in
          zip(nuisances.names, selection.end.b, prior, strict=True)},
@@ -518,6 +527,32 @@ def conclude(
         channels=channels,
         nuisance_scene=problem.nuisance_effects(nuisances, selection.end.b),
     )  # fmt: skip
+
+
+def _since(
+    where: Sequence[Where], outcome: Outcome, recordings: Sequence[Recording]
+) -> str:
+    """In words, from when on something is different; "" where nothing says so."""
+    first: dict[str, float] = {}
+    extents: dict[tuple[str, int], tuple[float, float]] = {}
+    for recording in recordings:
+        start = float(recording.time[0])
+        first[recording.name] = min(first.get(recording.name, start), start)
+        for episode in recording.episodes:
+            key, time = (recording.name, episode.number), recording.time[episode.rows]
+            low, high = extents.get(key, (np.inf, -np.inf))
+            extents[key] = min(low, float(time[0])), max(high, float(time[-1]))
+    found = begins(where, extents)
+    if found is not None:
+        name, _, at = found
+    else:
+        jumps = [u for u in outcome.unexplained if u.since is not None]
+        if not jumps:
+            return ""
+        name, at = recordings[0].name, float(jumps[0].since or 0.0)
+    place = f" of {name}" if len(first) > 1 else ""
+    at -= zero_of(first[name])
+    return f" From about {figure(at, 2)} s{place} on something is different."
 
 
 def _follows_noise(problem: GapProblem, selection: Selection) -> bool:

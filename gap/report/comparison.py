@@ -27,8 +27,7 @@ from pydrake.systems.framework import Context, DiagramBuilder
 
 from makebreak.gap.data.recording import Recording
 from makebreak.gap.report.clock import zero_of
-from makebreak.gap.result import GapResult, Series
-from makebreak.gap.verdict import plain
+from makebreak.gap.result import GapResult, Series, plain
 from makebreak.models.effects.kind import full_name, one_dof_joints, sliding_joints
 from makebreak.models.scene import LoadedScene, Scene, initial_for, load_scene
 

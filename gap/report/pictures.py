@@ -91,7 +91,7 @@ def picture_of_where(
         starts[key] = n
         bins[key] = max(round(_MOST_BINS * (high - low) / max(total, 1e-9)), 1)
         n += bins[key]
-    heat = np.full((len(names), n), np.nan)
+    heat, held = np.full((len(names), n), np.nan), []
     for each in result.where:
         if each.channel not in names:
             continue
@@ -103,6 +103,8 @@ def picture_of_where(
         b = min(max(b, a + 1), starts[key] + bins[key])
         row = heat[names.index(each.channel), a:b]
         row[:] = np.fmax(row, each.score)
+        if each.held_out:
+            held.append((a, b, names.index(each.channel)))
     figure = Figure(figsize=(10.0, 1.5 + 0.3 * len(names)), layout="constrained")
     axes = figure.add_subplot()
     axes.set_facecolor("#f3f4f6")
@@ -111,6 +113,8 @@ def picture_of_where(
         heat, aspect="auto", interpolation="nearest", cmap="YlOrRd",
         norm=LogNorm(1.0, top), extent=(0, n, len(names) - 0.5, -0.5),
     )  # fmt: skip
+    for a, b, at in held:
+        axes.plot([a, b], [at + 0.44] * 2, color="0.2", lw=1.5, solid_capstyle="butt")
     axes.set_yticks(np.arange(len(names)), names, fontsize=9)
     _time_ticks(axes, spans, starts, bins)
     bar = figure.colorbar(shown, ax=axes, pad=0.01)

@@ -12,8 +12,7 @@ from makebreak.gap.data.recording import Recording
 from makebreak.gap.report.clock import zeros_of
 from makebreak.gap.report.markup import cell, folded, image, section, table
 from makebreak.gap.report.summary import number, together, windows_of
-from makebreak.gap.result import GapResult, InUnits, Where
-from makebreak.gap.verdict import plain
+from makebreak.gap.result import GapResult, InUnits, Where, plain
 
 _SEVERITIES = ("error", "warning", "info")
 _MOST_TOLERANCES = 2.0  # Of a nuisance parameter: farther off, its model is doubtful.
@@ -35,7 +34,8 @@ def where(
             f"{sum(w.to_s - w.from_s for w in found):.3g} s",
             f"{found[0].score:.3g}",
             f"{found[0].from_s:.2f} - {found[0].to_s:.2f} s of {found[0].recording}, "
-            f"episode {found[0].episode}, {found[0].region}",
+            f"episode {found[0].episode}, {found[0].region}"
+            f"{', held out' if found[0].held_out else ''}",
         ]
         for (channel, region), found in groups.items()
     ]
@@ -51,7 +51,9 @@ def where(
         clock = " Times count from the start of a recording."
     note = (
         '<p class="small">Coloured: windows whose error is significantly larger than '
-        f"expected. Grey: no significant error, or nothing was measured.{clock}</p>"
+        "expected. Grey: no significant error, or nothing was measured. Underlined, "
+        "and 'held out': in the part that is reported on, by simulated windows."
+        f"{clock}</p>"
     )
     picture = image(pictures, "where", "Where the disagreement stands out")
     return section("Where", picture + note + table(heads, rows, most=6))

@@ -33,6 +33,7 @@ from makebreak.gap.residuals.objects import unexplained_in_windows
 from makebreak.gap.residuals.permitted_contacts import Shift
 from makebreak.gap.residuals.pose_times import earlier
 from makebreak.gap.residuals.touching import ROBUST
+from makebreak.gap.residuals.where import where_in_windows
 from makebreak.gap.residuals.widened_contacts import (
     distances_off,
     sentence,
@@ -660,6 +661,7 @@ class ContactProblem(ContactCandidates, GapProblem):
                 *unseen_series(model, effects, held),
             ],
             unexplained_in_windows(model, after),
+            where=where_in_windows(model, model.errors(before)) if recordings else (),
         )
 
 

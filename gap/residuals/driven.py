@@ -454,6 +454,7 @@ class DrivenProblem(DrivenWindows, GapProblem):
             gap_measure(model, before, after, held),
             series_of(model, before, after, held),
             unexplained_in_windows(model, after),
+            where=where_in_windows(model, model.errors(before)) if recordings else (),
         )
 
 

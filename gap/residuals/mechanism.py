@@ -653,7 +653,7 @@ class MechanismProblem(InverseModel, GapProblem):
 
         def measured_with(
             noise: dict[str, float],
-        ) -> tuple[GapMeasure, list[Series]] | None:
+        ) -> tuple[GapMeasure, list[Series], list[Where]] | None:
             return measure(
                 scene, effects, moved, model, model is not self, jobs,
                 self._is_pushed if model is self else lambda window: False, noise,
@@ -679,7 +679,8 @@ class MechanismProblem(InverseModel, GapProblem):
                 )
                 measured = more
         rest = unexplained(self, self.in_noise(end.left))
-        return Outcome(*measured, rest, expects)
+        gap, series, where = measured
+        return Outcome(gap, series, rest, expects, where)
 
     def _effort_of_nuisances(self, nuisances: Nuisances) -> dict[str, float]:
         """{joint: standard deviation of its effort [N m]} that is not known of the

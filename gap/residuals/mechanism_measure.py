@@ -9,7 +9,8 @@ import numpy as np
 from makebreak.gap.parallel import side_by_side
 from makebreak.gap.problem import rms
 from makebreak.gap.residuals.inverse import InverseModel
-from makebreak.gap.result import GapMeasure, InUnits, Series
+from makebreak.gap.residuals.where import where_in_windows
+from makebreak.gap.result import GapMeasure, InUnits, Series, Where
 from makebreak.gap.simulation.measure import WINDOW_SEC, gap_measure, series_of
 from makebreak.gap.simulation.windows import Window, WindowModel, seen_in
 from makebreak.models.effects import KINDS
@@ -27,9 +28,9 @@ def measure(
     jobs: int = 1,
     skip: Callable[[Window], bool] = lambda window: False,
     slow_noise: Mapping[str, float] | None = None,
-) -> tuple[GapMeasure, list[Series]] | None:
-    """Before and after over windows of the recordings that `motion` has; None where no
-    window counts.
+) -> tuple[GapMeasure, list[Series], list[Where]] | None:
+    """Before and after over windows of the recordings that `motion` has, and where
+    these stand out before; None where no window counts.
 
     Args: effects: to be added. moved: the background as far as its tolerance lets it,
         in both, as it is neither the gap nor its cure. motion: what tells how far a
@@ -63,7 +64,8 @@ def measure(
         gap,
         equations=_equations(motion, trials[0], trials[-1], every),
     )
-    return gap, series_of(model, before, after, held)
+    where = where_in_windows(model, model.errors(before)) if every else []
+    return gap, series_of(model, before, after, held), where
 
 
 def _simulated(model: WindowModel, effects: Sequence[Effect], held, lag):

@@ -124,6 +124,7 @@ class WindowedProblem(GapProblem):
             gap_measure(model, before, after, held),
             series,
             unexplained_in_windows(model, after),
+            where=where_in_windows(model, model.errors(before)) if recordings else (),
         )
 
     def _model(self) -> FreeBodyModel | WindowModel:
