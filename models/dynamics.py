@@ -74,16 +74,17 @@ class SceneDynamics:
         time = np.zeros(n) if time is None else time
         effort = np.empty((n, plant.num_velocities()))
         joint_forces = self.loaded.joint_forces
+        both = np.hstack([q, v])
         for k in range(n):
-            plant.SetPositions(context, q[k])
-            plant.SetVelocities(context, v[k])
+            plant.SetPositionsAndVelocities(context, both[k])
             plant.CalcForceElementsContribution(context, forces)
             if self._body_laws:
                 self._add_body_forces(time[k])
             effort[k] = plant.CalcInverseDynamics(context, vd[k], forces)
             if joint_forces is not None:
-                x = np.concatenate([q[k], v[k]]).tolist()
-                effort[k] -= joint_forces.force(x, time[k], self._joint_numbers)
+                effort[k] -= joint_forces.force(
+                    both[k].tolist(), time[k], self._joint_numbers
+                )
         return effort
 
     def momentum(self, q, v) -> np.ndarray:
@@ -138,9 +139,9 @@ class SceneDynamics:
         J, V, A = np.empty((n, 6, n_v)), np.empty((n, 6)), np.empty((n, 6))
         R = np.empty((n, 3, 3))
         wrt, B, zero = JacobianWrtVariable.kV, body.body_frame(), np.zeros(3)
+        both = np.hstack([q, v])
         for k in range(n):
-            plant.SetPositions(context, q[k])
-            plant.SetVelocities(context, v[k])
+            plant.SetPositionsAndVelocities(context, both[k])
             J[k] = plant.CalcJacobianSpatialVelocity(context, wrt, B, zero, W, W)
             bias = plant.CalcBiasSpatialAcceleration(context, wrt, B, zero, W, W)
             V[k], A[k] = J[k] @ v[k], J[k] @ vd[k] + bias.get_coeffs()

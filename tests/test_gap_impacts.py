@@ -24,8 +24,11 @@ from makebreak.gap.residuals.impacts import (
     TIMING,
     ImpactProblem,
     ImpactWindows,
+    nearest,
     positions,
     runs_against,
+    walls_of,
+    without_contact,
 )
 from makebreak.gap.residuals.pressing import PressingProblem, presses
 from makebreak.gap.workflow import problem_for, run_gap
@@ -33,6 +36,16 @@ from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import read_scene
 
+OWN_WALL = """<sdf version="1.7"><model name="slide">
+<link name="base"><collision name="wall"><pose>0.15 0 0 0 0 0</pose><geometry>
+<box><size>0.1 1 1</size></box></geometry></collision></link>
+<link name="ball"><inertial><mass>1</mass></inertial><collision name="ball"><geometry>
+<sphere><radius>0.02</radius></sphere></geometry></collision></link>
+<link name="carriage"><inertial><mass>1</mass></inertial></link>
+<joint name="x" type="prismatic"><parent>base</parent><child>carriage</child><axis>
+<xyz>1 0 0</xyz></axis></joint>
+<joint name="y" type="prismatic"><parent>carriage</parent>
+<child>ball</child><axis><xyz>0 1 0</xyz></axis></joint></model></sdf>"""
 _PARAMETER = {"damper": "damping"}  # Of the effect that is the cart's field.
 
 
@@ -332,3 +345,36 @@ def test_a_report_needs_no_more_than_one_touch(tmp_path):
     model = problem._again([short])
     assert model._touches == 1
     assert np.sqrt(np.mean(model.residual(()) ** 2)) < 1.2
+
+
+@pytest.mark.parametrize("is_struck", [False, True])
+def test_shapes_that_pass_through_their_own_base_are_not_struck(tmp_path, is_struck):
+    """A ball on a slide swings up to 40 mm into its own base's wall, or bounces off it:
+    in both the shapes overlap now and then, and only one of them is a touch."""
+    (tmp_path / "slide.sdf").write_text(OWN_WALL)
+    (tmp_path / "scene.yaml").write_text(
+        "directives:\n- add_model: {name: s, file: slide.sdf}\n"
+        "- add_weld: {parent: world, child: s::base}\n"
+    )
+    dynamics = SceneDynamics(read_scene(tmp_path / "scene.yaml"))
+    time = np.arange(0.0, 10.0, 0.005)
+    x = 0.07 * np.sin(2.0 * np.pi * 0.7 * time) + 0.05 * np.sin(2.0 * time)
+    if is_struck:  # It touches at 0.08 and turns 3 mm later: a soft wall.
+        x = np.minimum(x, 2.0 * 0.083 - x)
+    x = x + 5e-5 * np.random.default_rng(0).normal(size=len(time))
+    columns = {"time": time, "s.x.position": x, "s.y.position": 0.1 * np.sin(time)}
+    write_recording(tmp_path / "log.csv", columns)
+    recordings = read_recordings([tmp_path / "log.csv"])
+    q = positions(dynamics, recordings[0])
+    shapes = walls_of(dynamics, own=True)
+    np.testing.assert_allclose(nearest(shapes, dynamics, q), 0.08 - x, atol=1e-5)
+    assert _overlaps(dynamics, recordings) >= 3
+    assert runs_against(dynamics, recordings) == is_struck
+    assert bool(without_contact(dynamics, recordings)[1]) == is_struck
+
+
+def _overlaps(dynamics, recordings) -> int:
+    """How often the shapes overlap, by arithmetic: the wall's face is at 0.1, the
+    ball's radius 0.02."""
+    below = recordings[0]["s.x.position"] > 0.08
+    return int(np.sum(np.diff(below.astype(int)) == 1))

@@ -9,7 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import LinAlgError
+from scipy.linalg.lapack import dpotrf, dpotrs
 from scipy.stats import chi2, norm, wilcoxon
 from scipy.stats import t as student_t
 
@@ -59,7 +60,7 @@ class Screen:
         self._T, self._H = self._N[self._train], self._N[~self._train]
         self._NN = self._T.T @ self._T + self._s2 * np.diag(self._prior**-2)
         # Candidates differ little in which nuisances are at their limits.
-        self._factors: dict[bytes, tuple] = {}
+        self._factor = Factors(self._NN)
         self._Nr = self._T.T @ self.r[self._train]
         self._side = np.zeros(len(self._prior), int)
         if len(self._prior):
@@ -94,12 +95,12 @@ class Screen:
                 L = self._factor(free)
                 some = XN[:, free]
                 rest = Nr[free] - self._NN[np.ix_(free, ~free)] @ b[~free]
-                G = XX - some @ cho_solve(L, some.T)
-                g = g - some @ cho_solve(L, rest)
+                G = XX - some @ dpotrs(L, some.T)[0]
+                g = g - some @ dpotrs(L, rest)[0]
             inverse = _pseudo_inverse(G)
             c = inverse @ g
             if free.any():
-                b[free] = cho_solve(L, rest - some.T @ c)
+                b[free] = dpotrs(L, rest - some.T @ c)[0]
             return b, Nr - XN.T @ c - self._NN @ b
 
         b = np.zeros(len(self._prior))
@@ -111,13 +112,6 @@ class Screen:
         left = self.r - columns @ (c / size) - self._N @ b
         return self._fit(c / size, spread / size, b, left)
 
-    def _factor(self, free: np.ndarray):
-        """Cholesky's, of the nuisances that are free."""
-        key = free.tobytes()
-        if key not in self._factors:
-            self._factors[key] = cho_factor(self._NN[np.ix_(free, free)])
-        return self._factors[key]
-
     def evaluate(self, r, c=(), c_std=()) -> LinearFit:
         """For another residual (m,): with the nuisances that its training rows want."""
         b, left = self.fit_nuisances(r)
@@ -127,7 +121,8 @@ class Screen:
         """The nuisances' coefficients for a residual (m,), and what they leave."""
         if not len(self._prior):
             return np.zeros(0), r
-        b = boxed_minimum(self._NN, self._T.T @ r[self._train], self._limit)
+        g = self._T.T @ r[self._train]
+        b = boxed_minimum(self._NN, g, self._limit, self._factor)
         return b, r - self._N @ b
 
     def wanted(self, r) -> np.ndarray:
@@ -171,20 +166,40 @@ def _pseudo_inverse(A: np.ndarray) -> np.ndarray:
     return (u * np.where(good, 1.0 / np.where(good, w, 1.0), 0.0)) @ u.T
 
 
-def boxed_minimum(H, g, limit) -> np.ndarray:
+class Factors:
+    """Cholesky's factors (upper) of blocks of a symmetric positive definite matrix
+    (n, n), kept: the same few come again and again."""
+
+    def __init__(self, H: np.ndarray):
+        self._H = H
+        self._known: dict[bytes, np.ndarray] = {}
+
+    def __call__(self, free: np.ndarray) -> np.ndarray:
+        """Of the rows and columns that are free (n,)."""
+        key = free.tobytes()
+        if key not in self._known:
+            c, failed = dpotrf(self._H[np.ix_(free, free)])
+            if failed:
+                raise LinAlgError(f"row {failed} of a matrix makes it not definite")
+            self._known[key] = c
+        return self._known[key]
+
+
+def boxed_minimum(H, g, limit, factor: Factors | None = None) -> np.ndarray:
     """b (n,) with |b| <= limit (n,) at which b'Hb/2 - g'b is least; H (n, n) positive
-    definite.
+    definite; factor: of H, where it is used more than once.
 
     Source: the primal-dual active set of Hintermueller, Ito, Kunisch, SIAM J. Optim.
     13(3), 2002.
     """
     H, g = np.asarray(H, float), np.asarray(g, float)
     limit = np.broadcast_to(np.asarray(limit, float), g.shape)
+    factor = factor or Factors(H)
 
     def solve(free, b):
         if free.any():
             rest = g[free] - H[np.ix_(free, ~free)] @ b[~free]
-            b[free] = cho_solve(cho_factor(H[np.ix_(free, free)]), rest)
+            b[free] = dpotrs(factor(free), rest)[0]
         return b, g - H @ b
 
     return _within(solve, limit, np.diag(H))

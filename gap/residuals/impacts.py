@@ -40,6 +40,9 @@ LOOKS = 4000  # Rows at which it is first asked whether anything comes near.
 NEAR = 0.01  # [m]
 FEWEST = 3  # Touches.
 MOST_SHARE = 0.5  # Of the time, that may be spent in touch: else it lies there.
+# Rows beside a touch between which an approach changes, and by how many times what it
+# nearly always does elsewhere.
+BESIDE, FELT = 2, 2.0
 BESIDE_SEC, LEAST_SEC = 0.1, 0.5  # About a touch; a stretch without one.
 DRAWS = 3  # Of uncertain starts.
 BLUR = 0.003  # Of how far a channel goes in a window: laws are no better.
@@ -68,7 +71,9 @@ def _met_walls(
             shapes = walls_of(dynamics, own)
         except DoesNotFit:
             return None
-        if shapes is not None and _now_and_then(dynamics, shapes, recordings):
+        if shapes is None or not _now_and_then(dynamics, shapes, recordings):
+            continue
+        if not own or _is_felt(dynamics, shapes, recordings):
             return shapes
     return None
 
@@ -85,7 +90,7 @@ def without_contact(
             shapes = walls_of(dynamics, own)
         except DoesNotFit:
             return kept, []
-        if shapes is None:
+        if shapes is None or (own and not _is_felt(dynamics, shapes, recordings)):
             continue
         parts = [_apart(dynamics, shapes, recording) for recording in recordings]
         if all(part is None for part in parts) or any(
@@ -150,6 +155,34 @@ def _now_and_then(dynamics: SceneDynamics, shapes, recordings) -> bool:
     return touches >= FEWEST and inside < MOST_SHARE * whole
 
 
+def _is_felt(dynamics: SceneDynamics, shapes, recordings) -> bool:
+    """Whether something happens where shapes overlap: some pair's approach changes more
+    than in as many rows anywhere else. (Links of a robot's model pass through its own
+    base where those of the real one pass beside it.)"""
+    felt = 0
+    for recording in recordings:
+        q = positions(dynamics, recording)
+        for episode in recording.episodes:
+            time = recording.time[episode.rows]
+            if len(time) < FEWEST_ROWS:
+                continue
+            poses = poses_of(dynamics.plant, q[episode.rows], shapes)
+            slots = shapes.slots(poses, np.inf, _with_fixed(shapes))
+            overlap = np.any([s.phi < 0.0 for s in slots], axis=0)
+            last = len(time) - 1
+            for phi in (s.phi for s in slots):
+                rate = np.gradient(phi, time)
+                for a, b in runs_of(phi < 0.0):
+                    first, end = max(a - BESIDE, 0), min(b + BESIDE, last)
+                    n = end - first
+                    free = np.convolve(overlap, np.ones(n + 1), "valid") < 0.5
+                    usual = np.abs(rate[n:] - rate[:-n])[free]
+                    if len(usual):
+                        change = abs(rate[end] - rate[first])
+                        felt += bool(change > FELT * np.quantile(usual, 0.99))
+    return felt >= FEWEST
+
+
 def walls_of(dynamics: SceneDynamics, own: bool = False) -> ContactShapes | None:
     """Shapes of links, and of what is fixed and, unless `own`, no part of a robot; None
     if there are not both. Raises: DoesNotFit as ContactShapes."""
@@ -189,11 +222,12 @@ def positions(dynamics: SceneDynamics, recording: Recording) -> np.ndarray:
 
 def nearest(shapes: ContactShapes, dynamics: SceneDynamics, q) -> np.ndarray:
     """(n,) distance of the nearest pair of a link and what is fixed."""
+    return nearest_of(shapes, dynamics, q, _with_fixed(shapes))
 
-    def counts(a: int, b: int) -> bool:
-        return (a in shapes.anchored) != (b in shapes.anchored)
 
-    return nearest_of(shapes, dynamics, q, counts)
+def _with_fixed(shapes: ContactShapes) -> Callable[[int, int], bool]:
+    """Whether a pair of bodies is a link and something fixed."""
+    return lambda a, b: (a in shapes.anchored) != (b in shapes.anchored)
 
 
 def nearest_of(

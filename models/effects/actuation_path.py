@@ -47,11 +47,14 @@ class DriveLaw:
 
     def with_kp(self, kp) -> "DriveLaw":
         """The law with other gains, where they are not OWN."""
-        return replace(self, kp=np.where(np.equal(kp, OWN), self.kp, kp))
+        own = np.equal(kp, OWN)
+        return self if np.all(own) else replace(self, kp=np.where(own, self.kp, kp))
 
     def received(self, p_command):
         """The position command, rounded to the drive's resolution."""
         r = self.resolution
+        if not np.any(r):
+            return p_command
         step = np.where(np.greater(r, 0.0), r, 1.0)
         return np.where(
             np.greater(r, 0.0), np.round(p_command / step) * step, p_command
