@@ -68,7 +68,7 @@ from makebreak.gap.residuals.objects import (
 from makebreak.gap.residuals.pressing import PressingProblem, presses, push_each_other
 from makebreak.gap.residuals.sap_lift import sap_lift
 from makebreak.gap.residuals.tool_weight import as_used, check_tool_weight
-from makebreak.gap.residuals.where import begins
+from makebreak.gap.residuals.where import begins, spans_of
 from makebreak.gap.result import AGREES, GapMeasure, GapResult, JudgedChannel, Where
 from makebreak.gap.search.choice import Choice, Selection
 from makebreak.gap.search.chosen_by_simulation import (
@@ -495,7 +495,7 @@ def conclude(
         *(replace(w, held_out=True) for w in final.where),
     ]  # fmt: skip
     if verdict == "gap_unnamed":
-        near += _since(where, final, [*problem.recordings, *reported])
+        near += _since(where, final, problem.recordings, reported)
     if verdict == "gap_unnamed":
         near += problem.hint(selection.end)
     else:
@@ -530,19 +530,22 @@ def conclude(
 
 
 def _since(
-    where: Sequence[Where], outcome: Outcome, recordings: Sequence[Recording]
+    where: Sequence[Where],
+    outcome: Outcome,
+    decided: Sequence[Recording],
+    reported: Sequence[Recording],
 ) -> str:
-    """In words, from when on something is different; "" where nothing says so."""
-    first: dict[str, float] = {}
-    extents: dict[tuple[str, int], tuple[float, float]] = {}
-    for recording in recordings:
-        start = float(recording.time[0])
-        first[recording.name] = min(first.get(recording.name, start), start)
-        for episode in recording.episodes:
-            key, time = (recording.name, episode.number), recording.time[episode.rows]
-            low, high = extents.get(key, (np.inf, -np.inf))
-            extents[key] = min(low, float(time[0])), max(high, float(time[-1]))
-    found = begins(where, extents)
+    """In words, from when on something is different; "" where nothing says so: in all
+    of the recordings, in the part that was decided on, or in the one that is reported
+    on (of which by windows, which show other gaps)."""
+    recordings = [*decided, *reported]
+    parts = (
+        (where, recordings),
+        ([w for w in where if not w.held_out], decided),
+        ([w for w in where if w.held_out], reported),
+    )
+    each = (begins(some, spans_of(part)) for some, part in parts)
+    found = next((one for one in each if one is not None), None)
     if found is not None:
         name, _, at = found
     else:
@@ -550,8 +553,9 @@ def _since(
         if not jumps:
             return ""
         name, at = recordings[0].name, float(jumps[0].since or 0.0)
-    place = f" of {name}" if len(first) > 1 else ""
-    at -= zero_of(first[name])
+    first = min(float(r.time[0]) for r in recordings if r.name == name)
+    place = f" of {name}" if len({r.name for r in recordings}) > 1 else ""
+    at -= zero_of(first)
     return f" From about {figure(at, 2)} s{place} on something is different."
 
 

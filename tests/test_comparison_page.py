@@ -13,15 +13,18 @@ from pydrake.systems.framework import DiagramBuilder
 from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.data.table import write_recording
 from makebreak.gap.report.comparison import comparison_html, errors_of, shown_motion
+from makebreak.gap.report.files import write_report
 from makebreak.gap.residuals.objects import FlightProblem
-from makebreak.gap.result import GapResult
+from makebreak.gap.result import Estimate, Evidence, GapResult, NamedEffect, plain
 from makebreak.gap.simulation.commands import Commands
 from makebreak.gap.simulation.measure import gap_measure, series_of, unseen_series
 from makebreak.gap.simulation.scene_simulation import SceneSimulation
 from makebreak.gap.simulation.windows import WindowModel
+from makebreak.gap.verdict import says
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import InitialSection, load_scene
 from makebreak.models.scene_schema import ActuationSection
+from makebreak.scripts.gap_command import effects_table
 
 COULOMB = Effect("joint_coulomb_friction", ["p.j1"], {"coulomb": 0.35})
 TIME = np.arange(300) * 0.01
@@ -103,6 +106,45 @@ def test_a_driven_joint_moves_as_with_its_input(tmp_path, what):
         table = result.gap.in_units["p.j1.position"]
         assert np.sqrt(np.mean(after**2)) == pytest.approx(table.after)
         assert np.sqrt(np.mean(before**2)) == pytest.approx(table.before)
+
+
+@pytest.mark.parametrize("what", ["effort measured", "servo"])
+def test_sentence_table_page_animation_and_json_say_the_same(tmp_path, what):
+    """All against rms errors that are computed here from the windows' samples."""
+    scene, recordings = swung(tmp_path, what)
+    result = result_of(WindowModel(scene, recordings, 0.3), [COULOMB], scene)
+    [series] = result.series
+    before, after = (
+        np.sqrt(np.mean((series.measured - y) ** 2))
+        for y in (series.before, series.after)
+    )
+    expected = np.sqrt(np.mean(series.expected**2))
+    named = NamedEffect(
+        "joint_coulomb_friction", ("p.j1",), {"coulomb": Estimate(0.35, 0.01, "N m")},
+        "Joint p.j1 has friction.", Evidence(9.0, 1.0, "", np.nan),
+    )  # fmt: skip
+    text = says("gap_named", [named], result.gap)
+    result = replace(result, says=text, effects=[named])
+    folder = tmp_path / "out"
+    write_report(
+        result, scene, folder, recordings,
+        comparison=comparison_html(result, scene, recordings),
+    )  # fmt: skip
+    found = json.loads((folder / "result.json").read_text())
+    units = found["gap"]["in_units"]["p.j1.position"]
+    for name, size in (("before", before), ("after", after), ("expected", expected)):
+        assert units[name] == pytest.approx(size)
+        words = plain(size, "rad")
+        assert words in found["says"] and words in text
+        page = re.sub(r"<[^>]*>", " ", (folder / "report.html").read_text())
+        assert page.count(words) >= 2  # In the sentence and in the table.
+        if name != "expected":
+            moving = (folder / "compare.html").read_text()
+            assert f"rms over all that is shown {words}" in moving
+    table = effects_table(result).to_text()
+    assert text in table
+    for size in (found["gap"]["before"], found["gap"]["after"]):
+        assert f"{size:.3g}" in table and f"{size:.3g}" in text
 
 
 def tossed(folder, names="xyz", height=0.6):

@@ -50,17 +50,29 @@ class _Recording:
 
 
 class _Episode:
-    number, rows = 0, slice(0, 101)
+    def __init__(self, rows=slice(0, 101)):
+        self.number, self.rows = 0, rows
 
 
 @pytest.mark.parametrize("first", [0.0, 1.7e9])
 def test_the_sentence_says_it_on_the_clock_of_the_report(first):
     outcome = Outcome(GapMeasure(9.0, 9.0, 1.0, 0.3))
     where = [stretch(first + 8.2, first + 10.0, True)]
-    said = _since(where, outcome, [_Recording(first)])
+    said = _since(where, outcome, [_Recording(first)], [])
     assert said == " From about 8.2 s on something is different."
     jump = Unexplained("a.j.effort", "everywhere", 9.0, "time (...)", first + 4.5)
     outcome = Outcome(outcome.gap, unexplained=[jump])
-    said = _since([stretch(first, first + 10.0)], outcome, [_Recording(first)])
+    said = _since([stretch(first, first + 10.0)], outcome, [_Recording(first)], [])
     assert said == " From about 4.5 s on something is different."
-    assert _since([], Outcome(outcome.gap), [_Recording(first)]) == ""
+    assert _since([], Outcome(outcome.gap), [_Recording(first)], []) == ""
+
+
+def test_a_part_that_is_reported_on_says_when_it_begins_there_whatever_was_before():
+    """What was decided on stands out from its start, by another yardstick."""
+    where = [stretch(0.0, 7.9), stretch(8.8, 10.0, True)]
+    decided, reported = _Recording(0.0), _Recording(0.0)
+    decided.time, decided.episodes = decided.time[:80], [_Episode(slice(0, 80))]
+    reported.time, reported.episodes = reported.time[80:], [_Episode(slice(0, 21))]
+    outcome = Outcome(GapMeasure(9.0, 9.0, 1.0, 0.3))
+    said = _since(where, outcome, [decided], [reported])
+    assert said == " From about 8.8 s on something is different."

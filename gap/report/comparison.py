@@ -460,7 +460,7 @@ def _with_numbers(
         "order": json.dumps(order),
     }
     box = (
-        '<div style="position:fixed;left:14px;top:12px;z-index:10;padding:8px 12px;'
+        '<div style="position:fixed;left:14px;bottom:12px;z-index:10;padding:8px 12px;'
         "max-width:46em;font:14px/1.5 system-ui,sans-serif;"
         "font-variant-numeric:tabular-nums;background:rgba(255,255,255,.88);"
         f'border-radius:4px">{"<br>".join(lines)}</div>'

@@ -203,8 +203,8 @@ def picture_of_series(
         )  # fmt: skip
         unit = (units or {}).get(each.channel, "")
         right.set_title(
-            f"measured - simulated{f' [{unit}]' if unit else ''}; grey (2 sigma): "
-            "expected, dark: noise",
+            f"measured - simulated{f' [{unit}]' if unit else ''}; grey: expected "
+            "(2 sigma)",
             fontsize=9,
         )
         right.set_yscale("symlog", linthresh=max(float(np.max(expected)), 1e-12))

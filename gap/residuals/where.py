@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from makebreak.gap.data.recording import unit_of
+from makebreak.gap.data.recording import Recording, unit_of
 from makebreak.gap.numerics.selection import benjamini_hochberg
 from makebreak.gap.residuals.inverse import InverseModel
 from makebreak.gap.residuals.whitened_rows import REST_SPEED
@@ -137,6 +137,19 @@ def jump_time(t: np.ndarray, y: np.ndarray) -> float | None:
     told = before**2 * n / (k * (n - k))  # Of the sum of squares.
     best = int(np.argmax(told))
     return float(t[k[best]]) if told[best] > 0.5 * np.sum(y**2) else None
+
+
+def spans_of(
+    recordings: Sequence[Recording],
+) -> dict[tuple[str, int], tuple[float, float]]:
+    """{(recording, episode): from and to [s]} of all that is in recordings."""
+    found: dict[tuple[str, int], tuple[float, float]] = {}
+    for recording in recordings:
+        for episode in recording.episodes:
+            key, time = (recording.name, episode.number), recording.time[episode.rows]
+            low, high = found.get(key, (np.inf, -np.inf))
+            found[key] = min(low, float(time[0])), max(high, float(time[-1]))
+    return found
 
 
 def begins(
