@@ -277,12 +277,11 @@ def _draw(
             for path, body in bodies.items():
                 X_WB = plant.EvalBodyPoseInWorld(context, body)
                 meshcat.SetTransform(f"/{who}/{path}", X_WB, float(now))
-                if who == "measured":
-                    seen += [
-                        X_WB @ pose.translation()
-                        for other, _, pose, _ in moving
-                        if other.split("/")[0] == path
-                    ]
+                seen += [
+                    X_WB @ pose.translation()
+                    for other, _, pose, _ in moving
+                    if other.split("/")[0] == path
+                ]
     animation = meshcat.get_mutable_recording()
     animation.set_autoplay(True)
     animation.set_loop_mode(MeshcatAnimation.LoopMode.kLoopRepeat)

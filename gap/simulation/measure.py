@@ -8,7 +8,7 @@ import numpy as np
 from makebreak.gap.data.recording import Recording, unit_of
 from makebreak.gap.problem import rms
 from makebreak.gap.result import GapMeasure, InUnits, Series
-from makebreak.gap.simulation.windows import WindowModel, seen_in
+from makebreak.gap.simulation.windows import TURN, WindowModel, seen_in
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect, sliding_joints
 
@@ -50,9 +50,8 @@ def gap_measure(model: Windows, before, after, held: Sequence[bool]) -> GapMeasu
     both = ~(np.isnan(of_whole(before)) | np.isnan(of_whole(after)))
     both &= np.isfinite(of_whole([seen_in(model, w) for w in model.windows]))
     stds = [w.std for w in model.windows]
-    ones = [np.ones_like(std) for std in stds]
     over = [of_whole(model.errors_over(each, stds)) for each in (before, after)]
-    plain = [of_whole(model.errors_over(each, ones)) for each in (before, after)]
+    plain = [of_whole(_off(model, each)) for each in (before, after)]
 
     def rms_of(e: np.ndarray, c) -> float:
         return rms(e[:, c][both[:, c]])
@@ -82,6 +81,27 @@ def gap_measure(model: Windows, before, after, held: Sequence[bool]) -> GapMeasu
             for w in (model.windows[k] for k in picked)
         )),
     )  # fmt: skip
+
+
+def _off(model: Windows, simulated: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """(n, n_channels) measured minus simulated of each window, as it is: nothing is
+    capped as fits need it. q and -q are one orientation."""
+    at = {name: c for c, name in enumerate(model.channels)}
+    bodies = {name.rsplit(".", 1)[0] for name in at}
+    turns = [[at[f"{body}.{q}"] for q in TURN] for body in sorted(bodies)
+             if all(f"{body}.{q}" in at for q in TURN)]  # fmt: skip
+    out = []
+    for w, y in zip(model.windows, simulated, strict=True):
+        seen = seen_in(model, w)
+        if not len(y):
+            out.append(y)
+            continue
+        for turn in turns:
+            y = np.array(y)
+            same = np.sum(np.nan_to_num(y[:, turn] * seen[:, turn]), axis=1)
+            y[:, turn] *= np.where(same < 0.0, -1.0, 1.0)[:, None]
+        out.append(seen - y)
+    return out
 
 
 def series_of(
