@@ -7,15 +7,21 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from test_gap_report import small_case
 
 from makebreak.gap import budget as budgets
 from makebreak.gap.budget import Budget, Stopped
+from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.report.files import write_report
+from makebreak.gap.residuals.mechanism import MechanismProblem
+from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.workflow import run_gap
+from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import read_scene
 from makebreak.scripts import cli, interrupts
 
@@ -151,6 +157,20 @@ def test_each_part_of_a_run_has_its_own_end(monkeypatch):
         assert may("search")
     now[0] = 31.0  # Nobody waits for long who asked for the end.
     assert [may(part) for part in parts] == [False] * 4
+
+
+def test_effects_that_no_scene_can_have_change_no_weights(case):
+    """A link of less than no mass: a fit of equations may go there."""
+    [recording] = read_recordings([case[1]])
+    problem = MechanismProblem(read_scene(case[0]), [recording])
+    search = Comparison(problem, lambda text: None)
+    body = problem.dynamics.places("link_mass")[0]
+    light = Effect("link_mass", [body], {"mass": -5.0})
+    with pytest.raises(ValueError):
+        problem.model_with([light])
+    before = problem.base()
+    problem.reweigh(replace(search.start, effects=(light,)))
+    np.testing.assert_array_equal(problem.residual(), before)
 
 
 # ----- The command

@@ -302,7 +302,10 @@ class MechanismProblem(InverseModel, GapProblem):
         key = tuple(e.key for e in effects if self._reweighs(e))
         if key == self._weighed:
             return False
-        model, gains = self.model_with(effects), self.gains_with(effects)
+        try:
+            model, gains = self.model_with(effects), self.gains_with(effects)
+        except ValueError:  # A joint that is too light for its drive, say.
+            return False
         if not self._moves_as_much(model):
             return False
         self._weighed = key
