@@ -66,11 +66,15 @@ def coupled_joints(path: Path) -> dict[str, str]:
     """{joint: the one that it follows} of a URDF, SDF or MJCF; none where it cannot be
     read, which a parser says better."""
     try:
-        # Drake knows `drake:` without a declaration of it.
-        document = expatbuilder.parse(str(path), namespaces=False)
+        return couplings_in(path.read_text(errors="replace"))
     except (ExpatError, OSError):
         return {}
-    return dict(_couplings(document))
+
+
+def couplings_in(text: str) -> dict[str, str]:
+    """{joint: the one that it follows} of a model's text."""
+    # Drake knows `drake:` without a declaration of it.
+    return dict(_couplings(expatbuilder.parseString(text.encode(), namespaces=False)))
 
 
 def _couplings(document: minidom.Document) -> Iterator[tuple[str, str]]:

@@ -1,19 +1,16 @@
 """Adds the models of a scene's directives to a plant: files, packages, inertias.
 
-Checks what Drake would replace silently (impossible inertias), abort on (directives
-that include themselves) or refuse without need (missing visual meshes).
+Checks what Drake would replace silently (impossible inertias) or abort on (directives
+that include themselves).
 """
 
 import logging
-import re
 import tempfile
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from xml.dom import minidom
-from xml.parsers.expat import ExpatError
 
 import numpy as np
 from pydrake.multibody.parsing import (
@@ -33,14 +30,15 @@ from makebreak.models.effects.kind import (
     full_name,
     one_dof_joints,
 )
-from makebreak.models.effects.model_text import (
-    children,
-    edited_model_file,
-    make_mesh_paths_absolute,
-    read_inertial,
-    text,
+from makebreak.models.effects.model_text import edited_model_file
+from makebreak.models.fixed_joints import couplings_in, fix_joints
+from makebreak.models.model_inertias import ModelText, mended
+from makebreak.models.robot_file import (
+    RobotFile,
+    is_robot,
+    path_of,
+    read_robot_file,
 )
-from makebreak.models.fixed_joints import coupled_joints, fix_joints
 from makebreak.models.scene_schema import COMMANDS_OF, Scene
 from makebreak.models.typed_yaml import one_line, read_yaml
 
@@ -66,7 +64,8 @@ def add_models(scene: Scene, effects: Sequence[Effect], plant: MultibodyPlant) -
         for i, directive in enumerate(flat.directives):
             add = directive.add_model
             if add is not None:
-                add.file = _usable(add.file, packages, Path(folder) / f"visual_{i}")
+                add.file = _usable(add.file, packages, Path(folder) / f"{i}")
+        _with_mended_inertias(flat, scene, packages)
         for i, effect in enumerate(effects):
             edit = KINDS[effect.kind].edit_text
             if edit is None:
@@ -86,12 +85,7 @@ def add_models(scene: Scene, effects: Sequence[Effect], plant: MultibodyPlant) -
                     raise ValueError(
                         f"effect {effect.kind} at {at!r}: no model {model!r} is added"
                     )
-        with _drake_warnings() as warnings:
-            try:
-                ProcessModelDirectives(flat, parser)
-            except DRAKE_ERRORS as error:
-                raise ValueError(f"scene's directives: {one_line(error)}") from None
-        _refuse_inertias(flat.directives, packages, warnings)
+        _process(flat, parser)
     if scene.fixed_joints:
         _check_fixed_together(scene)
         fix_joints(plant, scene.fixed_joints, len(couplings_of(scene)))
@@ -104,13 +98,44 @@ def couplings_of(scene: Scene) -> dict[str, str]:
     found: dict[str, str] = {}
     for directive in _flattened(scene.directives, packages).directives:
         add = directive.add_model
-        path = None if add is None else _path_of(add.file, Path("/"), packages)
-        if add is not None and path is not None:
+        path = None if add is None else path_of(add.file, Path("/"), packages)
+        if add is not None and path is not None and is_robot(path):
+            text = read_robot_file(path, packages, bare=True).text
             found |= {
                 f"{add.name}.{joint}": f"{add.name}.{other}"
-                for joint, other in coupled_joints(path).items()
+                for joint, other in couplings_in(text).items()
             }
     return found
+
+
+def with_what_files_say(scene: Scene) -> Scene:
+    """The scene with what its models' files say of their joints and Drake keeps no
+    place for, as effects: dry friction, rotors, springs; and with the positions of
+    their first keyframe, where the scene has no initial state. What the scene itself
+    says of a joint counts, and joints that do not move have none."""
+    packages = PackageMap()
+    _add_packages(scene, packages)
+    named = {(e.kind, at) for e in scene.effects for at in e.at}
+    effects = list(scene.effects)
+    home: dict[str, float] = {}
+    for directive in _flattened(scene.directives, packages).directives:
+        add = directive.add_model
+        path = None if add is None else path_of(add.file, Path("/"), packages)
+        if path is None or not is_robot(path) or not path.is_file():
+            continue
+        assert add is not None
+        file = read_robot_file(path, packages, bare=True)
+        for effect in file.effects:
+            at = f"{add.name}.{effect.at[0]}"
+            is_said = {(effect.kind, at), (effect.kind, add.name)} & named
+            if at not in scene.fixed_joints and not is_said:
+                effects.append(replace(effect, at=[at]))
+        home |= {f"{add.name}.{joint}": q for joint, q in file.home.items()}
+    home = {joint: q for joint, q in home.items() if joint not in scene.fixed_joints}
+    initial = scene.initial
+    if home and not initial.positions and not scene.initial_of:
+        initial = replace(initial, positions=home)
+    return replace(scene, effects=effects, initial=initial)
 
 
 def _check_fixed_together(scene: Scene) -> None:
@@ -191,129 +216,45 @@ def _add_packages(scene: Scene, packages: PackageMap) -> None:
         packages.Add(name, where)
 
 
-def _path_of(uri: str, near: Path, packages: PackageMap) -> Path | None:
-    """The file of a URI as Drake reads it (no %20, and "#" is part of the name); None
-    for an unknown package. Args: near: the file that contains the URI."""
-    scheme, separator, rest = uri.partition("://")
-    if not separator:
-        return near.parent / uri
-    if scheme not in ("package", "model"):
-        return Path(rest)
-    name, *inside = Path(rest).parts or ("",)
-    if not packages.Contains(name):
-        found = _package_above(name, near)
-        if found is None:
-            return None
-        packages.Add(name, str(found))
-    return Path(packages.GetPath(name)).joinpath(*inside)
-
-
-def _package_above(name: str, near: Path) -> Path | None:
-    """The folder above a file whose name, or whose package.xml, is the package's."""
-    for folder in near.resolve().parents:
-        manifest = folder / "package.xml"
-        if folder.name == name or (
-            manifest.is_file()
-            and re.search(
-                rf"<name>\s*{re.escape(name)}\s*</name>",
-                manifest.read_text(errors="replace"),
-            )
-        ):
-            return folder
-    return None
-
-
-_MESH = re.compile(r"""<mesh\b[^>]*?filename\s*=\s*["']([^"']+)|<uri>\s*([^<]+?)\s*<""")
-
-
 def _usable(uri: str, packages: PackageMap, copy: Path) -> str:
-    """URI of the model, or of a copy without its missing visual meshes.
+    """URI of a robot's file as Drake reads it (robot_file.py), written as a copy; of
+    other files their own.
 
-    Raises: ValueError for other missing meshes.
+    Raises: ValueError for a collision mesh that is not there.
     """
-    path = _path_of(uri, Path("/"), packages)
+    path = path_of(uri, Path("/"), packages)
     if path is None:
         raise _unknown_package(uri)
-    if path.suffix.lower() not in (".urdf", ".sdf") or not path.is_file():
+    if not is_robot(path):
         return uri
-    source = path.read_text(errors="replace")
-    lost = _lost_meshes(source, path, packages)
-    if not lost:
-        return uri
-    try:
-        document = minidom.parseString(source.encode())
-    except ExpatError:
-        return uri  # Drake's own message is better.
-    gone = _without_meshes(document, "visual", lost)
-    left = {a or b for a, b in _MESH.findall(document.toxml())} & set(lost)
-    for mesh in sorted(left):
-        if lost[mesh] is None:
+    file = read_robot_file(path, packages)
+    for mesh, where in sorted(file.lost.items()):
+        if where is None:
             raise _unknown_package(mesh, path)
-        raise ValueError(f"{path}: {mesh} does not exist ({lost[mesh]})")
-    _warn_once(
-        f"{path.name}: {gone} visual meshes are left out, as they are not there "
-        f"({sorted(lost)[0]}{', ...' if len(lost) > 1 else ''})"
-        + ("; --package NAME=PATH says where" if None in lost.values() else "")
-    )
-    make_mesh_paths_absolute(document, path.parent)
-    target = copy.with_suffix(path.suffix)
-    target.write_text(document.toxml())
+        why = "cannot be read as a mesh" if where.is_file() else "does not exist"
+        raise ValueError(f"{path}: {mesh} {why} ({where})")
+    if file.path.suffix == ".xml" and file.left_out:
+        raise ValueError(f"{path}: {file.left_out} meshes of its shapes are not there")
+    lost = file.lost_visuals
+    if lost:
+        _warn_once(
+            f"{path.name}: {file.visuals_left_out} visual meshes are left out, as they "
+            f"are not there ({sorted(lost)[0]}{', ...' if len(lost) > 1 else ''})"
+            + ("; --package NAME=PATH says where" if None in lost.values() else "")
+        )
+    copy.mkdir()
+    target = copy / f"{path.stem}{file.suffix}"  # Errors name it.
+    target.write_text(file.text)
     return f"file://{target}"
 
 
-def _lost_meshes(
-    source: str, path: Path, packages: PackageMap
-) -> dict[str, Path | None]:
-    """{mesh of a file that is not there: where it should be; None: package unknown}."""
-    lost = {}
-    for mesh in {a or b for a, b in _MESH.findall(source)}:
-        where = _path_of(mesh, path, packages)
-        if where is None or not where.exists():
-            lost[mesh] = where
-    return lost
-
-
-def _without_meshes(
-    document: minidom.Document, kind: str, lost: Collection[str]
-) -> int:
-    """Takes out elements of a kind, visual or collision, that have one of these meshes.
-    Returns: how many."""
-    gone = []
-    for element in document.getElementsByTagName(kind):
-        shapes = children(element, "geometry", "mesh")
-        names = [mesh.getAttribute("filename") for mesh in shapes]
-        names += [text(uri).strip() for m in shapes for uri in children(m, "uri")]
-        if any(name in lost for name in names):
-            gone.append(element)
-    for element in gone:
-        assert element.parentNode is not None
-        element.parentNode.removeChild(element)
-    return len(gone)
-
-
-def without_lost_collisions(path: Path, given: Mapping[str, str]) -> tuple[str, int]:
-    """The text of a robot's file without the collision meshes that are not there, nor
-    visual ones, for use where it touches nothing; and how many collision meshes are
-    left out. given: {package: folder}."""
-    source = path.read_text(errors="replace")
+def without_lost_collisions(path: Path, given: Mapping[str, str]) -> RobotFile:
+    """A robot's file without the collision meshes that are not there, for use where it
+    touches nothing. given: {package: folder}."""
     packages = PackageMap()
     for name, where in given.items():
         packages.Add(name, where)
-    lost = _lost_meshes(source, path, packages)
-    if path.suffix.lower() not in (".urdf", ".sdf") or not lost:
-        return source, 0
-    try:
-        document = minidom.parseString(source.encode())
-    except ExpatError:
-        return source, 0  # Drake's own message is better.
-    gone = _without_meshes(document, "collision", lost)
-    _without_meshes(document, "visual", lost)
-    for element in document.getElementsByTagName("mesh"):  # Packages that were found.
-        file = _path_of(element.getAttribute("filename"), path, packages)
-        if element.getAttribute("filename") and file is not None:
-            element.setAttribute("filename", f"file://{file.resolve()}")
-    make_mesh_paths_absolute(document, path.parent)
-    return document.toxml(), gone
+    return read_robot_file(path, packages, bare=True)
 
 
 def _unknown_package(uri: str, path: Path | None = None) -> ValueError:
@@ -352,7 +293,7 @@ def _check_includes(
 ) -> None:
     """Raises: ValueError for directives that include themselves, at which Drake would
     overflow its stack."""
-    path = _path_of(uri, near, packages)
+    path = path_of(uri, near, packages)
     if path is None:
         raise _unknown_package(uri)
     path = path.resolve()
@@ -373,64 +314,60 @@ def _check_includes(
 # ----- Inertias
 
 
+class _InertiasAreChecked(logging.Filter):
+    """Keeps Drake's words about inertias back while it parses: model_inertias.py has
+    looked at them before, and MuJoCo has at those of MJCF."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        message = record.getMessage().lower()
+        return "inertia" not in message and "'friction'" not in message
+
+
 @contextmanager
-def _drake_warnings() -> Iterator[list[str]]:
-    """Collects Drake's warnings about inertias while it parses; others pass."""
-    found: list[str] = []
-    log = logging.getLogger("drake")
-
-    def keep(record: logging.LogRecord) -> bool:
-        message = record.getMessage()
-        if "inertia" not in message.lower():
-            return True
-        found.append(one_line(ValueError(message)))
-        return False
-
-    log.addFilter(keep)
+def checked_inertias() -> Iterator[None]:
+    log, quiet = logging.getLogger("drake"), _InertiasAreChecked()
+    log.addFilter(quiet)
     try:
-        yield found
+        yield
     finally:
-        log.removeFilter(keep)
+        log.removeFilter(quiet)
 
 
-def _refuse_inertias(
-    directives: Sequence[ModelDirective], packages: PackageMap, warnings: list[str]
+def _with_mended_inertias(
+    flat: ModelDirectives, scene: Scene, packages: PackageMap
 ) -> None:
-    """Raises: ValueError that names a link with an impossible inertia, which Drake
-    would replace by another one."""
-    if not warnings:
-        return
-    for directive in directives:
-        add = directive.add_model
-        path = None if add is None else _path_of(add.file, Path("/"), packages)
-        if path is None or path.suffix.lower() not in (".urdf", ".sdf"):
-            continue
-        for link in minidom.parse(str(path)).getElementsByTagName("link"):
-            fault = _fault(link)
-            if fault:
-                assert add is not None
-                raise ValueError(
-                    f"model {add.name}: link {link.getAttribute('name')!r} {fault}"
-                )
-    raise ValueError(f"a link's inertia is impossible: {warnings[0]}")
+    """Mends the copies of the models' texts, in place."""
+    paths = {
+        d.add_model.name: path_of(d.add_model.file, Path("/"), packages)
+        for d in flat.directives if d.add_model is not None
+    }  # fmt: skip
+    texts = [
+        ModelText(name, path.read_text()) for name, path in paths.items()
+        if path is not None and path.suffix in (".urdf", ".sdf")
+    ]  # fmt: skip
+
+    def make_plant() -> MultibodyPlant:
+        plant = MultibodyPlant(0.0)
+        parser = Parser(plant)
+        _add_packages(scene, parser.package_map())
+        _process(flat, parser)
+        fix_joints(plant, scene.fixed_joints, plant.num_constraints())
+        plant.Finalize()
+        return plant
+
+    new, notes = mended(texts, make_plant)
+    for before, after in zip(texts, new, strict=True):
+        if after is not before:
+            path = paths[after.name]
+            assert path is not None
+            path.write_text(after.text)
+    for note in notes:
+        _warn_once(note)
 
 
-def _fault(link: minidom.Element) -> str:
-    """What is wrong with a link's inertia; "" if nothing is."""
-    if not children(link, "inertial", "mass"):
-        return ""
-    try:
-        inertial = read_inertial(link)
-    except ValueError:
-        return ""
-    if not inertial.mass >= 0.0:
-        return f"has the mass {inertial.mass:g} [kg], expected >= 0"
-    least, middle, greatest = np.linalg.eigvalsh(inertial.central)
-    if inertial.mass == 0.0 and greatest > 0.0:
-        return "has moments of inertia without a mass"
-    if not (least >= 0.0 and least + middle >= greatest * (1.0 - 1e-9)):
-        return (
-            f"has the central moments of inertia {least:g}, {middle:g}, {greatest:g} "
-            "[kg m2]: of no body is one negative, or more than the two others together"
-        )
-    return ""
+def _process(flat: ModelDirectives, parser: Parser) -> None:
+    with checked_inertias():
+        try:
+            ProcessModelDirectives(flat, parser)
+        except DRAKE_ERRORS as error:
+            raise ValueError(f"scene's directives: {one_line(error)}") from None

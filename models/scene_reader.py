@@ -10,7 +10,7 @@ from pydrake.common.yaml import yaml_dump, yaml_load_typed
 from pydrake.multibody.parsing import ModelDirective
 
 from makebreak.models.drives import law_of
-from makebreak.models.model_files import with_actuated_joints
+from makebreak.models.model_files import with_actuated_joints, with_what_files_say
 from makebreak.models.scene_schema import InitialSection, Scene, check_scene
 from makebreak.models.typed_yaml import (
     convert,
@@ -43,7 +43,7 @@ def read_scene(path: str | Path) -> Scene:
     try:
         scene = _scene(read_yaml(path), path.parent)
         check_scene(scene)
-        scene = with_actuated_joints(scene)
+        scene = with_actuated_joints(with_what_files_say(scene))
         for joint in scene.actuation.joints:
             law_of(scene.actuation, joint)  # Checks the number of gains.
         return scene

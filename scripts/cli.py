@@ -206,7 +206,7 @@ def _gap_until(args, interrupt, drake) -> int:
             f"{robot} is a recording, expected the scene or robot first: "
             "makebreak gap SCENE RECORDING"
         )
-    is_robot = robot.suffix.lower() in (".urdf", ".sdf", ".xml")
+    is_robot = robot.suffix.lower() in (".urdf", ".sdf", ".xml", ".xacro")
     scene = robot if is_robot else Path(scene_file(args.scene, "SCENE"))
     out = Path(args.out) if args.out else default_out("gap")
     export = [word for word in (args.export or "").split(",") if word]

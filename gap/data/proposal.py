@@ -16,6 +16,7 @@ from makebreak.gap.data.table import COMMANDS, is_channel
 
 DEG = np.pi / 180.0
 UNKNOWN_JOINT = "of an unknown joint"  # Why such a column is left out.
+AS_SAID = "as the recording's sidecar says"
 _COMMAND = set(
     "cmd command commands commanded target desired des ref reference goal goals "
     "setpoint action sp control".split()
@@ -162,7 +163,7 @@ def said_of(columns: Mapping) -> dict[str, Match]:
         own = target if isinstance(target, dict) else {"channel": target}
         found[str(name)] = Match(
             str(name), own.get("channel"), float(own.get("scale", 1.0)),
-            float(own.get("offset", 0.0)), "as the recording's sidecar says",
+            float(own.get("offset", 0.0)), AS_SAID,
         )  # fmt: skip
     return found
 

@@ -21,6 +21,7 @@ from makebreak.gap.data.findings import (
     Finding,
 )
 from makebreak.gap.data.proposal import (
+    AS_SAID,
     CURRENT,
     UNKNOWN_JOINT,
     JointName,
@@ -39,12 +40,14 @@ from makebreak.gap.data.table import (
     stem_of,
     suffix_of,
 )
+from makebreak.models.effects import KINDS
+from makebreak.models.effects.joints import ROTOR
 from makebreak.models.effects.kind import actuator_of, one_dof_joints
-from makebreak.models.fixed_joints import coupled_joints, fix_joints
-from makebreak.models.model_files import without_lost_collisions
+from makebreak.models.fixed_joints import couplings_in, fix_joints
+from makebreak.models.model_files import checked_inertias, without_lost_collisions
+from makebreak.models.robot_file import RobotFile
 from makebreak.models.scene_reader import given_packages
 
-ROBOTS = (".urdf", ".sdf", ".xml")
 GUESSED_KP = 10.0  # [N m/rad], where the log does not show it.
 # [1/s] Of a loop of speed: it settles in a few hundredths of a second. Its gain is this
 # times what the joint moves: one number for all joints would be too stiff to simulate
@@ -68,10 +71,7 @@ class Robot:
     bases: tuple[str, ...]
     effort_limits: dict[str, float]
     plant: MultibodyPlant
-
-
-def is_robot(path: Path) -> bool:
-    return path.suffix.lower() in ROBOTS
+    file: RobotFile
 
 
 def read_robot(path: Path) -> Robot:
@@ -95,30 +95,36 @@ def read_robot(path: Path) -> Robot:
         limits[name] = np.inf if actuator is None else actuator.effort_limit()
     if not joints:
         raise ValueError(f"robot {path} has no joint that turns or slides")
-    return Robot(path, model, tuple(joints), bases, limits, plant)
+    file = without_lost_collisions(path, given_packages())
+    return Robot(path, model, tuple(joints), bases, limits, plant, file)
 
 
 def _load(
     path: Path, welded: Sequence[str] = (), fixed: Mapping[str, float] | None = None
 ) -> MultibodyPlant:
     """fixed: {joint, without the model's name: where it stands}."""
-    if not path.is_file():
-        raise ValueError(f"robot {path} does not exist")
     plant = MultibodyPlant(0.0)
+    file = without_lost_collisions(path, given_packages())
     try:
-        # Without a scene graph no mesh is looked for.
-        models = Parser(plant).AddModels(str(path.resolve()))
+        with checked_inertias():
+            # Without a scene graph no mesh is looked for.
+            parser = Parser(plant)
+            models = parser.AddModelsFromString(file.text, file.suffix[1:])
         if len(models) != 1:
             raise ValueError(f"it holds {len(models)} models, expected one")
         for base in welded:
             plant.WeldFrames(plant.world_frame(), plant.GetFrameByName(base))
         model = plant.GetModelInstanceName(models[0])
         there = {f"{model}.{name}": q for name, q in (fixed or {}).items()}
-        fix_joints(plant, there, len(coupled_joints(path)))
+        fix_joints(plant, there, len(couplings_in(file.text)))
+        for effect in file.effects:
+            add = KINDS[effect.kind].before_finalize
+            if add is not None and effect.at[0] not in (fixed or {}):
+                add(replace(effect, at=[f"{model}.{effect.at[0]}"]), plant, None)
         plant.Finalize()
     except (RuntimeError, ValueError) as error:
-        why = " ".join(str(error).split())[:300]
-        raise ValueError(f"robot {path} cannot be read: {why}") from None
+        why = " ".join(str(error).split())
+        raise ValueError(f"robot {path} cannot be read: {why[:1000]}") from None
     return plant
 
 
@@ -139,7 +145,7 @@ def _standing(robot: Robot, every, logs, some_unknown: bool) -> dict[str, float]
     """
     coupled = {
         f"{robot.model}.{one}": f"{robot.model}.{other}"
-        for one, other in coupled_joints(robot.path).items()
+        for one, other in couplings_in(robot.file.text).items()
     }
     scaled = [_scaled(log, every[log.path]) for log in logs]
     seen = {name.rpartition(".")[0] for channels in scaled for name in channels}
@@ -159,7 +165,8 @@ def _standing(robot: Robot, every, logs, some_unknown: bool) -> dict[str, float]
             continue  # Where it stands would be a guess.
         q = [c[f"{joint.name}.position"] for c in scaled
              if f"{joint.name}.position" in c]  # fmt: skip
-        middle = float(np.nanmedian(np.concatenate(q))) if q else 0.0
+        home = robot.file.home.get(joint.name.partition(".")[2], 0.0)
+        middle = float(np.nanmedian(np.concatenate(q))) if q else home
         found[joint.name] = float(
             f"{np.clip(np.nan_to_num(middle), joint.lower, joint.upper):.6g}"
         )
@@ -288,6 +295,7 @@ def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
     every = {log.path: of_one_drive(matches_of(log, robot)) for log in logs}
     unused = dict.fromkeys(m.column for matches in every.values() for m in matches
                            if m.why.endswith(UNKNOWN_JOINT))  # fmt: skip
+    every = {path: _through_gears(robot, own) for path, own in every.items()}
     fixed = _standing(robot, every, logs, bool(unused))
     if fixed:
         robot = _with_fixed(robot, fixed)
@@ -318,12 +326,11 @@ def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
         "directives:",
         f"- add_model: {{name: {robot.model}, file: {json.dumps(_file(robot))}}}",
     ]
-    copy, left_out = without_lost_collisions(robot.path, given_packages())
-    if left_out:
-        name = f"{robot.path.stem}_without_meshes{robot.path.suffix}"
+    if left_out := robot.file.left_out:
+        name = f"{robot.path.stem}_without_meshes{robot.file.suffix}"
         lines[-1] = f"- add_model: {{name: {robot.model}, file: {name}}}"
         lines[-1] += "  # A copy: collision meshes are not there."
-        copies = {name: copy}
+        copies = {name: robot.file.text}
         notes.append(
             f"{left_out} collision meshes of {robot.path.name} are not there and left "
             "out, so it touches nothing (--package NAME=PATH says where they are)"
@@ -343,7 +350,11 @@ def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
     actuation, gains = _actuation(robot, kinds, every, logs, notes)
     if actuation == NO_ACTUATION:
         _check_currents(every)
-    lines += ["plant: {time_step: 0.001}", *actuation]
+    gravity = list(robot.file.gravity)
+    own = "" if gravity == [0.0, 0.0, -9.81] else f", gravity: {gravity}"
+    lines += [f"plant: {{time_step: 0.001{own}}}", *actuation]
+    lines += _effects_of_file(robot, fixed, lines)
+    notes += [f"{robot.path.name}: {note}" for note in robot.file.notes]
     sidecars = {
         log.path: sidecar_text(every[log.path], log.own)
         for log in logs
@@ -364,6 +375,44 @@ def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
         stem_of(logs[0].path),
         copies,
     )
+
+
+def _effects_of_file(robot: Robot, fixed, lines: Sequence[str]) -> list[str]:
+    """Lines of what the file says of joints and Drake has no place for."""
+    out = []
+    for effect in robot.file.effects:
+        at = f"{robot.model}.{effect.at[0]}"
+        said = any(f"kind: {effect.kind}, at: {at}," in line for line in lines)
+        if at in fixed or said:
+            continue
+        values = ", ".join(f"{key}: {x!r}" for key, x in effect.parameters.items())
+        out.append(
+            f"- {{kind: {effect.kind}, at: {at}, parameters: {{{values}}}}}"
+            "  # From the file."
+        )
+    if out and not any(line.startswith("effects:") for line in lines):
+        out.insert(0, "effects:")
+    return out
+
+
+def _through_gears(robot: Robot, matches: Sequence[Match]) -> list[Match]:
+    """Commands of a file's own actuators (MJCF's ctrl) as efforts and positions of the
+    joints: an effort times the gear, a servo's command over it."""
+    out = []
+    for match in matches:
+        at, _, what = (match.channel or "").rpartition(".")
+        drive = robot.file.drives.get(at.partition(".")[2])
+        scale = 1.0
+        if drive is not None and match.why != AS_SAID:
+            if what == "effort_command" and not drive.kp and not drive.kd:
+                scale = drive.gear
+            elif what == "position_command" and drive.kp:
+                scale = 1.0 / drive.gear
+        if drive is not None and scale != 1.0:
+            why = f"{match.why}; by the gear {drive.gear:g} of {robot.path.name}"
+            match = replace(match, scale=match.scale * scale, why=why)
+        out.append(match)
+    return out
 
 
 def _check_currents(every: Mapping[Path, Sequence[Match]]) -> None:
@@ -425,6 +474,9 @@ def _actuation(
         gains = _gains_by_motion(robot, every, logs)
         stiff = _stiffness(robot, every, logs)
         stiff |= {joint: own.kp for joint, own in gains.items()}
+        file = {f"{robot.model}.{j}": d for j, d in robot.file.drives.items() if d.kp}
+        if all(joint in file for joint in joints):
+            return _servos_of_file(robot, joints, file, notes), ""
         known = [k for k in stiff.values() if k > 0.0]
         guess = float(np.median(known)) if known else GUESSED_KP
         kp = [float(f"{stiff.get(j, 0.0) or guess:.3g}") for j in joints]
@@ -451,6 +503,9 @@ def _actuation(
         rotors, moved = [], _inertia(robot)
         for joint, k in zip(joints, kd, strict=True):
             inertia = gains[joint].rotor if joint in gains else ROTOR_SEC * k
+            own = (ROTOR, [joint.partition(".")[2]])
+            if any((e.kind, e.at) == own for e in robot.file.effects):
+                continue
             if joint not in gains or inertia > LEAST_ROTOR * moved[joint]:
                 rotors.append(
                     f"- {{kind: rotor_inertia, at: {joint}, "
@@ -473,6 +528,24 @@ def _actuation(
         "the log has no command and no effort, so no torque acts on the joints"
     )
     return NO_ACTUATION, ""
+
+
+def _servos_of_file(robot: Robot, joints, drives, notes: list[str]) -> list[str]:
+    """Lines of position servos whose gains are in the file."""
+    notes.append(f"drives are the position servos of {robot.path.name}")
+    limits = [drives[j].limit for j in joints]
+    limit = []
+    if any(np.isfinite(limits)):
+        own = [float(x) if np.isfinite(x) else 1e9 for x in limits]
+        limit = [f"  limit: {own}  # [N m]"]
+    return [
+        "actuation:",
+        "  type: servo  # From the file.",
+        f"  joints: [{', '.join(joints)}]",
+        f"  kp: {[float(drives[j].kp) for j in joints]}  # [N m/rad]",
+        f"  kd: {[float(drives[j].kd) for j in joints]}  # [N m s/rad]",
+        *limit,
+    ]
 
 
 def _inertia(robot: Robot) -> dict[str, float]:

@@ -1,17 +1,16 @@
 """Edits of URDF, SDF and MJCF files, for properties that Drake reads only from a file.
 
-Of an MJCF file only inertias can be edited.
+Of an MJCF file, which is as mjcf.py writes it, only inertias can be edited.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from xml.dom import minidom
+from xml.dom import expatbuilder, minidom
 
 import numpy as np
 from pydrake.math import RollPitchYaw
-from pydrake.multibody.parsing import PackageMap, Parser
-from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.parsing import PackageMap
 
 from makebreak.models.effects.kind import Effect
 
@@ -35,7 +34,8 @@ def edited_model_file(
     where = f"effect {effect.kind} at {effect.at}"
     if path.suffix not in (".urdf", ".sdf", ".xml"):
         raise ValueError(f"{where}: {path.name} is neither URDF nor SDF nor MJCF")
-    document = minidom.parse(str(path))  # Keeps prefixes such as drake: as they are.
+    # Keeps prefixes such as drake: as they are.
+    document = expatbuilder.parse(str(path), namespaces=False)
     tag = "body" if path.suffix == ".xml" else "link"
     links = [x for x in document.getElementsByTagName(tag) if x.hasAttribute("name")]
     chosen = [
@@ -47,7 +47,7 @@ def edited_model_file(
         names = ", ".join(link.getAttribute("name") for link in links)
         raise ValueError(f"{where}: expected one link of {path.name}: {names}")
     if tag == "body":
-        _edit_mjcf(document, chosen[0], path, effect, edit)
+        _edit_mjcf(document, chosen[0], effect, edit)
     else:
         edit(effect, chosen[0])
     make_mesh_paths_absolute(document, path.parent)
@@ -70,47 +70,31 @@ def model_path(uri: str, package_map: PackageMap) -> Path:
 def _edit_mjcf(
     document: minidom.Document,
     body: minidom.Element,
-    path: Path,
     effect: Effect,
     edit: Callable[[Effect, minidom.Element], None],
 ) -> None:
-    """Gives a body of an MJCF file the inertia that Drake reads for it (which may be of
-    its geoms, or by defaults), with the edit made, as its own `inertial`."""
-    for compiler in document.getElementsByTagName("compiler"):
-        if compiler.getAttribute("inertiafromgeom") == "true":
-            compiler.setAttribute("inertiafromgeom", "auto")
-            for unused in document.getElementsByTagName("inertial"):
-                if unused.parentNode is not None:
-                    unused.parentNode.removeChild(unused)
-    name = body.getAttribute("name")
-    inertial = _inertial_by_drake(path, name)
-    link = _element(document, "link", name=name)
+    """Makes the edit to a body's `inertial`, which has a `fullinertia` (mjcf.py)."""
+    if not children(body, "inertial"):
+        name = body.getAttribute("name")
+        raise ValueError(f"body {name!r} has no mass and inertia to change")
+    (old,) = children(body, "inertial")
+    com, full = (
+        [float(x) for x in old.getAttribute(key).split()]
+        for key in ("pos", "fullinertia")
+    )
+    link = _element(document, "link", name=body.getAttribute("name"))
     own = link.appendChild(_element(document, "inertial"))
-    own.appendChild(_element(document, "mass", value=repr(inertial.mass)))
-    own.appendChild(_element(document, "origin", xyz=_numbers(inertial.com)))
-    moments = {
-        f"i{key}": repr(float(inertial.central[i, j]))
-        for key, (i, j) in (MOMENTS | PRODUCTS).items()
-    }
+    own.appendChild(_element(document, "mass", value=old.getAttribute("mass")))
+    own.appendChild(_element(document, "origin", xyz=_numbers(com)))
+    keys = (f"i{key}" for key in MOMENTS | PRODUCTS)
+    moments = dict(zip(keys, map(repr, full), strict=True))
     own.appendChild(_element(document, "inertia", **moments))
     edit(effect, link)
     new = read_inertial(link)
-    for old in children(body, "inertial"):
-        body.removeChild(old)
-    full = [new.central[i, j] for i, j in (MOMENTS | PRODUCTS).values()]
-    written = _element(
-        document, "inertial", pos=_numbers(new.com), mass=repr(new.mass),
-        fullinertia=_numbers(full),
-    )  # fmt: skip
-    body.insertBefore(written, body.firstChild)
-
-
-def _inertial_by_drake(path: Path, body: str) -> "Inertial":
-    plant = MultibodyPlant(0.0)  # Without a scene graph no mesh is looked for.
-    (model,) = Parser(plant).AddModels(str(path))
-    M = plant.GetBodyByName(body, model).default_spatial_inertia()
-    central = M.Shift(M.get_com()).CalcRotationalInertia().CopyToFullMatrix3()
-    return Inertial(float(M.get_mass()), np.array(M.get_com()), np.array(central))
+    written = [new.central[i, j] for i, j in (MOMENTS | PRODUCTS).values()]
+    old.setAttribute("pos", _numbers(new.com))
+    old.setAttribute("mass", repr(new.mass))
+    old.setAttribute("fullinertia", _numbers(written))
 
 
 def _element(document: minidom.Document, tag: str, **attributes) -> minidom.Element:
@@ -259,7 +243,8 @@ def write_inertial(link: minidom.Element, inertial: Inertial) -> None:
     Raises: ValueError for an unphysical inertia, which Drake would replace by another.
     """
     least, middle, greatest = np.linalg.eigvalsh(inertial.central)
-    if not (least >= 0.0 and least + middle >= greatest * (1.0 - 1e-9)):
+    slack = 1e-9 * abs(greatest) + 1e-15  # Rounding, and nothing [kg m2].
+    if not (least >= -slack and least + middle >= greatest - slack):
         raise ValueError(
             f"link {link.getAttribute('name')!r}: no body has the central moments of "
             f"inertia {least:g}, {middle:g}, {greatest:g} [kg m2]"

@@ -1,0 +1,498 @@
+"""MJCF as MuJoCo means it: compiled, and written again in plain words for Drake.
+
+Drake's parser knows a part of MJCF: neither nested default classes nor most actuators,
+and no reference positions. So MuJoCo compiles the file, and Drake gets one that has
+only what it reads exactly: bodies, explicit inertias, joints, shapes.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import numpy as np
+
+from makebreak.models.effects.kind import Effect
+from makebreak.models.meshes import write_obj
+
+
+@dataclass(frozen=True)
+class FileDrive:
+    """A joint's actuators in a file, at the joint: kp [N m/rad], kd [N m s/rad], both 0
+    of a motor; limit [N m]; gear: joint effort over what the command of a motor says,
+    or of a servo the command over the joint's position."""
+
+    kp: float = 0.0
+    kd: float = 0.0
+    limit: float = np.inf
+    gear: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class PlainMjcf:
+    """text: MJCF for Drake. effects: of joints, by their names in the file, that Drake
+    keeps no place for. drives, home: {joint: ...}, home of the first keyframe (or the
+    joint's reference). notes: what is left out, and what that means. left_out: number
+    of collision meshes that are not there."""
+
+    text: str
+    effects: tuple[Effect, ...] = ()
+    drives: dict[str, FileDrive] = field(default_factory=dict)
+    home: dict[str, float] = field(default_factory=dict)
+    gravity: tuple[float, ...] = (0.0, 0.0, -9.81)
+    notes: tuple[str, ...] = ()
+    left_out: int = 0
+
+
+def plain_mjcf(path: Path) -> PlainMjcf:
+    """Raises: ValueError, one line, for what MuJoCo refuses, or where it is missing."""
+    model, name, left_out = _compiled(path)
+    return _Writer(model, name, left_out).write()
+
+
+def _compiled(path: Path):
+    """MuJoCo's model, its name, and how many collision meshes are not there."""
+    try:
+        import mujoco
+    except ImportError:
+        raise ValueError(
+            f"{path.name} is MJCF, which is read with MuJoCo: expected its Python "
+            "package (Python 3.11 or newer; pip install mujoco)"
+        ) from None
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+        left_out = _without_lost_meshes(spec, path.parent)
+        model = spec.compile()
+    except ValueError as error:
+        raise ValueError(f"{path}: MuJoCo says: {' '.join(str(error).split())}") from (
+            None
+        )
+    name = spec.modelname
+    return model, path.stem if name in ("", "MuJoCo Model") else name, left_out
+
+
+def _without_lost_meshes(spec, folder: Path) -> int:
+    """Takes out meshes that are not there, with their shapes, and textures. Returns:
+    how many shapes could have touched something.
+
+    Raises: ValueError where a body's inertia is that of such a shape.
+    """
+
+    def lost(file: str, where: str) -> bool:
+        return bool(file) and not (folder / where / file).is_file()
+
+    for texture in list(spec.textures):
+        files = [texture.file, *texture.cubefiles]
+        if any(lost(file, spec.texturedir) for file in files):
+            for material in spec.materials:
+                material.textures = ["" for _ in material.textures]
+            spec.delete(texture)
+    gone = {m.name or Path(m.file).stem: m for m in spec.meshes
+            if lost(m.file, spec.meshdir)}  # fmt: skip
+    count = 0
+    by_shapes = int(spec.compiler.inertiafromgeom) == 1  # mjINERTIAFROMGEOM_TRUE
+    for geom in list(spec.geoms) if gone else []:
+        if geom.meshname not in gone:
+            continue
+        body = geom.parent
+        weighs = by_shapes or not body.explicitinertial
+        if weighs and body.name != "world" and geom.mass != 0.0:
+            raise ValueError(
+                f"the mesh {gone[geom.meshname].file} of body {body.name!r} is not "
+                "there, and its inertia is that of its shapes"
+            )
+        count += bool(geom.contype or geom.conaffinity)
+        spec.delete(geom)
+    for mesh in gone.values():
+        spec.delete(mesh)
+    return count
+
+
+def _numbers(values) -> str:
+    return " ".join(repr(float(x)) for x in np.ravel(values))
+
+
+class _Writer:
+    """Writes one compiled model. Joints' frames are set so that a position is that of
+    MuJoCo, also where a joint has a reference (ref)."""
+
+    def __init__(self, model, name: str, left_out: int):
+        import mujoco
+
+        self.mj, self.m, self.name, self.left_out = mujoco, model, name, left_out
+        self.notes: list[str] = []
+        self.effects: list[Effect] = []
+        self.meshes: dict[int, str] = {}
+        self.named: dict[tuple[str, int], str] = {}
+        # What a motor turns along acts at the joint, by its gear squared.
+        self.armature = np.array(model.dof_armature, dtype=float)
+        self.damping = np.array(model.dof_damping, dtype=float)
+        for a in range(len(model.actuator_trntype)):
+            if (j := self._driven(a)) is not None:
+                dof, gear = model.jnt_dofadr[j], model.actuator_gear[a][0]
+                self.armature[dof] += gear**2 * model.actuator_armature[a]
+                self.damping[dof] += gear**2 * model.actuator_damping[a]
+
+    def _driven(self, a: int) -> int | None:
+        """The joint of one degree of freedom that an actuator drives alone."""
+        m, kinds = self.m, self.mj.mjtTrn
+        j = int(m.actuator_trnid[a][0])
+        at = (int(kinds.mjTRN_JOINT), int(kinds.mjTRN_JOINTINPARENT))
+        return j if m.actuator_trntype[a] in at and m.jnt_type[j] >= 2 else None
+
+    def write(self) -> PlainMjcf:
+        m = self.m
+        root = ET.Element("mujoco", model=self.name)
+        ET.SubElement(root, "compiler", angle="radian", autolimits="true")
+        self.assets = ET.SubElement(root, "asset")
+        places = {0: ET.SubElement(root, "worldbody")}
+        self._shapes(0, places[0])
+        for body in range(1, m.nbody):
+            places[body] = self._body(body, places[m.body_parentid[body]])
+        self._contact(root)
+        self._equality(root)
+        drives = self._actuators(root)
+        self._left_out()
+        ET.indent(root)
+        return PlainMjcf(
+            ET.tostring(root, encoding="unicode") + "\n", tuple(self.effects), drives,
+            self._home(), tuple(float(x) for x in m.opt.gravity), tuple(self.notes),
+            self.left_out,
+        )  # fmt: skip
+
+    def _name(self, kind: str, index: int) -> str:
+        """The name of a body, joint or other element, or one by its number."""
+        known = self.named.get((kind, index))
+        if known is None:
+            known = getattr(self.m, kind)(index).name or f"{kind}_{index}"
+            self.named[kind, index] = known
+        return known
+
+    # ----- Bodies
+
+    def _body(self, i: int, parent: ET.Element) -> ET.Element:
+        m, mj = self.m, self.mj
+        pos, quat = m.body_pos[i].copy(), m.body_quat[i].copy()
+        first, n = m.body_jntadr[i], m.body_jntnum[i]
+        joints = range(first, first + n)
+        free = [j for j in joints if m.jnt_type[j] == mj.mjtJoint.mjJNT_FREE]
+        start = m.key_qpos[0] if m.nkey else m.qpos0
+        if free:
+            q = start[m.jnt_qposadr[free[0]] :][:7]
+            pos, quat = q[:3], q[3:] / np.linalg.norm(q[3:])
+        # X_PB at positions of 0, and the joints of the body as they then are. MuJoCo
+        # turns a body by each of its joints in turn, from its reference position.
+        R = _rotation(quat)
+        links: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+        for j in joints:
+            X, p = np.eye(3), np.zeros(3)
+            axis, anchor = m.jnt_axis[j], m.jnt_pos[j]
+            if m.jnt_type[j] == mj.mjtJoint.mjJNT_HINGE:
+                X = _turn(axis, -m.qpos0[m.jnt_qposadr[j]])
+                p = anchor - X @ anchor
+            elif m.jnt_type[j] == mj.mjtJoint.mjJNT_SLIDE:
+                p = -m.qpos0[m.jnt_qposadr[j]] * axis
+            links.append((X, p, anchor))
+        at = parent
+        if len(joints) > 1:
+            # A chain of bodies without mass, one for each joint.
+            for j, (X, p, _) in zip(joints, links, strict=True):
+                last = j == first + n - 1
+                own = self._name("body", i)
+                name = own if last else f"{own}_{self._name('joint', j)}"
+                at = ET.SubElement(
+                    at, "body", name=name, pos=_numbers(pos + R @ p),
+                    quat=_numbers(_quaternion(R @ X)),
+                )  # fmt: skip
+                pos, R = np.zeros(3), np.eye(3)
+                self._joint(j, at)
+        else:
+            for X, p, _ in links:
+                pos, R = pos + R @ p, R @ X
+            at = ET.SubElement(
+                parent, "body", name=self._name("body", i), pos=_numbers(pos),
+                quat=_numbers(_quaternion(R)),
+            )  # fmt: skip
+            for j in joints:
+                self._joint(j, at)
+        about = _rotation(m.body_iquat[i])
+        central = about @ np.diag(m.body_inertia[i]) @ about.T
+        six = central[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+        if m.body_mass[i]:
+            ET.SubElement(
+                at, "inertial", pos=_numbers(m.body_ipos[i]),
+                mass=_numbers(m.body_mass[i]), fullinertia=_numbers(six),
+            )  # fmt: skip
+        self._shapes(i, at)
+        if m.body_gravcomp[i]:
+            self.notes.append(
+                f"body {self._name('body', i)}: gravcomp {m.body_gravcomp[i]:g} is "
+                "left out, so all of its weight loads the joints"
+            )
+        return at
+
+    def _joint(self, j: int, at: ET.Element) -> None:
+        m, name = self.m, self._name("joint", j)
+        kind = ("free", "ball", "slide", "hinge")[m.jnt_type[j]]
+        dof = m.jnt_dofadr[j]
+        one = kind in ("slide", "hinge")
+        attributes = {"name": name, "type": kind}
+        if kind != "free":
+            attributes["pos"] = _numbers(m.jnt_pos[j])
+            attributes["damping"] = _numbers(self.damping[dof])
+        if one:
+            attributes["axis"] = _numbers(m.jnt_axis[j])
+            attributes["limited"] = "true" if m.jnt_limited[j] else "false"
+            if m.jnt_limited[j]:
+                attributes["range"] = _numbers(m.jnt_range[j])
+        elif m.jnt_limited[j]:
+            self.notes.append(f"joint {name}: the range of a ball is left out")
+        ET.SubElement(at, "joint", attributes)
+        values = {
+            "armature": ("rotor_inertia", {"inertia": self.armature[dof]}),
+            "frictionloss": (
+                "joint_coulomb_friction", {"coulomb": m.dof_frictionloss[dof]},
+            ),
+            "stiffness": (
+                "joint_spring",
+                {"stiffness": m.jnt_stiffness[j],
+                 "rest": m.qpos_spring[m.jnt_qposadr[j]]},
+            ),
+        }  # fmt: skip
+        for word, (effect, parameters) in values.items():
+            parameters = {key: float(x) for key, x in parameters.items()}
+            value = next(iter(parameters.values()))
+            if value and one:
+                self.effects.append(Effect(effect, [name], parameters))
+            elif value:
+                self.notes.append(
+                    f"joint {name}: {word} {value:g} of a {kind} joint is left out"
+                )
+        if kind == "free" and self.damping[dof]:
+            self.notes.append(
+                f"joint {name}: damping {self.damping[dof]:g} of a free joint is left "
+                "out"
+            )
+        for word, poly in (("damping", m.dof_dampingpoly[dof]),
+                           ("stiffness", m.jnt_stiffnesspoly[j])):  # fmt: skip
+            if np.any(poly):
+                self.notes.append(
+                    f"joint {name}: of its {word} only the linear part is taken"
+                )
+
+    # ----- Shapes
+
+    def _shapes(self, body: int, at: ET.Element) -> None:
+        m = self.m
+        first = m.body_geomadr[body]
+        for g in range(first, first + m.body_geomnum[body]):
+            kind = self.mj.mjtGeom(m.geom_type[g]).name[len("mjGEOM_") :].lower()
+            touches = bool(m.geom_contype[g] or m.geom_conaffinity[g])
+            if kind == "mesh":
+                if not touches:
+                    continue  # For display alone.
+                more = {"mesh": self._mesh(int(m.geom_dataid[g]))}
+            elif kind in ("plane", "sphere", "capsule", "ellipsoid", "cylinder", "box"):
+                size = m.geom_size[g].copy()
+                if kind == "plane":
+                    size[2] = size[2] or 1.0
+                more = {"size": _numbers(size)}
+            else:
+                if touches:
+                    self.notes.append(
+                        f"geom {self._name('geom', g)}: a shape of type {kind} is left "
+                        "out"
+                    )
+                continue
+            attributes = {
+                "name": self._name("geom", g), "type": kind, **more, "mass": "0",
+                "pos": _numbers(m.geom_pos[g]), "quat": _numbers(m.geom_quat[g]),
+                "friction": _numbers(m.geom_friction[g][:1]),
+                "rgba": _numbers(m.geom_rgba[g]),
+            }  # fmt: skip
+            if not touches:
+                attributes |= {"contype": "0", "conaffinity": "0", "group": "1"}
+            ET.SubElement(at, "geom", attributes)
+
+    def _mesh(self, i: int) -> str:
+        if i not in self.meshes:
+            m = self.m
+            v, f = m.mesh_vertadr[i], m.mesh_faceadr[i]
+            obj = write_obj(
+                m.mesh_vert[v : v + m.mesh_vertnum[i]],
+                m.mesh_face[f : f + m.mesh_facenum[i]],
+            )
+            self.meshes[i] = f"mesh_{i}"
+            ET.SubElement(self.assets, "mesh", name=self.meshes[i], file=str(obj))
+        return self.meshes[i]
+
+    def _contact(self, root: ET.Element) -> None:
+        m = self.m
+        contact = ET.SubElement(root, "contact")
+        for pair in m.exclude_signature:
+            one, two = int(pair) >> 16, int(pair) & 0xFFFF
+            ET.SubElement(
+                contact, "exclude", body1=self._name("body", one),
+                body2=self._name("body", two),
+            )  # fmt: skip
+
+    # ----- Constraints and actuators
+
+    def _equality(self, root: ET.Element) -> None:
+        m, mj = self.m, self.mj
+        lost: dict[str, int] = {}
+        found = ET.SubElement(root, "equality")
+        for e in range(m.neq):
+            kind = mj.mjtEq(m.eq_type[e])
+            if kind == mj.mjtEq.mjEQ_JOINT and m.eq_obj2id[e] >= 0:
+                ET.SubElement(
+                    found, "joint", joint1=self._name("joint", m.eq_obj1id[e]),
+                    joint2=self._name("joint", m.eq_obj2id[e]),
+                    polycoef=_numbers(m.eq_data[e][:5]),
+                )  # fmt: skip
+                continue
+            word = kind.name[len("mjEQ_") :].lower()
+            lost[word] = lost.get(word, 0) + 1
+        for word, count in lost.items():
+            self.notes.append(
+                f"{count} equality constraint{'s' if count > 1 else ''} of type {word} "
+                "left out, so the force in a loop that it closes is missing"
+            )
+
+    def _actuators(self, root: ET.Element) -> dict[str, FileDrive]:
+        """One motor for each joint that has some, and the drives as MuJoCo has them."""
+        m = self.m
+        drives: dict[str, FileDrive] = {}
+        lost = []
+        for a in range(len(m.actuator_trntype)):
+            j = self._driven(a)
+            if j is not None:
+                drive = self._drive(a, j)
+                name = self._name("joint", j)
+                known = drives.get(name)
+                if drive is None:
+                    drive = FileDrive()
+                    lost.append(self._name("actuator", a))
+                if known is not None:  # A position and a velocity servo together.
+                    drive = FileDrive(
+                        known.kp + drive.kp, known.kd + drive.kd,
+                        known.limit + drive.limit, known.gear,
+                    )  # fmt: skip
+                drives[name] = drive
+            else:
+                lost.append(self._name("actuator", a))
+        if lost:
+            shown = ", ".join(lost[:6]) + (", ..." if lost[6:] else "")
+            self.notes.append(
+                f"actuators {shown}: neither motors nor servos of joints (tendons, "
+                "sites, muscles, filters), so what they do is left out"
+            )
+        motors = ET.SubElement(root, "actuator")
+        for name, drive in drives.items():
+            attributes = {"name": name, "joint": name}
+            if np.isfinite(drive.limit):
+                attributes["ctrllimited"] = "true"
+                attributes["ctrlrange"] = _numbers([-drive.limit, drive.limit])
+            ET.SubElement(motors, "motor", attributes)
+        return drives
+
+    def _drive(self, a: int, j: int) -> FileDrive | None:
+        """force = gain ctrl + b0 + b1 length + b2 velocity, and the joint's effort is
+        gear force, with length = gear q. None for other laws."""
+        m, mj = self.m, self.mj
+        gear = float(m.actuator_gear[a][0])
+        gain, bias = m.actuator_gainprm[a], m.actuator_biasprm[a]
+        affine = m.actuator_biastype[a] == mj.mjtBias.mjBIAS_AFFINE
+        plain = m.actuator_biastype[a] == mj.mjtBias.mjBIAS_NONE
+        integrates = m.actuator_dyntype[a] == mj.mjtDyn.mjDYN_INTEGRATOR
+        if not (
+            gear
+            and m.actuator_gaintype[a] == mj.mjtGain.mjGAIN_FIXED
+            and (m.actuator_dyntype[a] == mj.mjtDyn.mjDYN_NONE or integrates)
+            and (affine or plain)
+        ):
+            return None
+        b0, b1, b2 = (float(x) for x in (bias[:3] if affine else np.zeros(3)))
+        g = float(gain[0])
+        limits = [np.inf]
+        if m.actuator_forcelimited[a]:
+            limits.append(abs(gear) * float(np.abs(m.actuator_forcerange[a]).max()))
+        if m.jnt_actfrclimited[j]:
+            limits.append(float(np.abs(m.jnt_actfrcrange[j]).max()))
+        if b0 or not g:
+            return None
+        if b1:  # A servo of position: gain (ctrl - length), or of its integral.
+            if not np.isclose(b1, -g, rtol=1e-6) or b1 > 0.0 or b2 > 0.0:
+                return None
+            kp, kd = g * gear**2, -b2 * gear**2
+            if integrates:
+                self.notes.append(
+                    f"actuator {self._name('actuator', a)}: its command is a velocity "
+                    "that MuJoCo adds up to a position; here it follows a position"
+                )
+            return FileDrive(kp, kd, min(limits), gear)
+        if integrates:
+            return None
+        if b2:  # A servo of velocity.
+            if not np.isclose(b2, -g, rtol=1e-6) or b2 > 0.0:
+                return None
+            return FileDrive(0.0, g * gear**2, min(limits), gear)
+        if m.actuator_ctrllimited[a]:
+            most = float(np.abs(m.actuator_ctrlrange[a]).max())
+            limits.append(most * abs(g * gear))
+        return FileDrive(0.0, 0.0, min(limits), g * gear)
+
+    def _home(self) -> dict[str, float]:
+        m = self.m
+        start = m.key_qpos[0] if m.nkey else m.qpos0
+        return {
+            self._name("joint", j): float(start[m.jnt_qposadr[j]])
+            for j in range(m.njnt)
+            if m.jnt_type[j] >= 2 and start[m.jnt_qposadr[j]]
+        }
+
+    def _left_out(self) -> None:
+        m = self.m
+        for t in range(m.ntendon):
+            words = {
+                "stiffness": m.tendon_stiffness[t], "damping": m.tendon_damping[t],
+                "frictionloss": m.tendon_frictionloss[t],
+                "armature": m.tendon_armature[t], "limits": m.tendon_limited[t],
+            }  # fmt: skip
+            there = [word for word, value in words.items() if np.any(value)]
+            if there:
+                self.notes.append(
+                    f"tendon {self._name('tendon', t)}: its {' and '.join(there)} "
+                    "left out"
+                )
+        if m.nflex:
+            self.notes.append(f"{m.nflex} flexible bodies: their stiffness is left out")
+        if m.opt.density or m.opt.viscosity:
+            self.notes.append("forces of the air or water around are left out")
+        if np.any(m.opt.wind):
+            self.notes.append("the wind is left out")
+
+
+def _rotation(quat: Sequence[float] | np.ndarray) -> np.ndarray:
+    """(3, 3) of a quaternion w x y z."""
+    w, x, y, z = np.asarray(quat, float) / np.linalg.norm(quat)
+    return np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ])  # fmt: skip
+
+
+def _quaternion(R: np.ndarray) -> np.ndarray:
+    """w x y z of a rotation (3, 3): the eigenvector that it is, so exact at half turns
+    as well (Bar-Itzhack, J. Guidance 23(6), 2000)."""
+    (a, b, c), (d, e, f), (g, h, i) = R
+    K = np.array([
+        [a + e + i, h - f, c - g, d - b], [h - f, a - e - i, b + d, c + g],
+        [c - g, b + d, e - a - i, f + h], [d - b, c + g, f + h, i - a - e],
+    ])  # fmt: skip
+    return np.linalg.eigh(K)[1][:, -1]
+
+
+def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
+    return _rotation([np.cos(angle / 2), *(np.sin(angle / 2) * axis)])

@@ -1,0 +1,343 @@
+"""URDF, SDF and xacro as people have them: meshes, packages, inertias, friction."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from pydrake.systems.framework import DiagramBuilder
+
+from makebreak.gap.data.robot import propose_scene, read_log, read_robot
+from makebreak.models.effects.model_text import Inertial
+from makebreak.models.model_export import to_mjcf, to_urdf
+from makebreak.models.model_inertias import fault_of, faults_of, repaired
+from makebreak.models.scene import load_scene, read_scene
+
+LINK = """<link name="{name}"><inertial><origin xyz="0 0 -0.2"/><mass value="{m}"/>
+<inertia ixx="{I[0]}" iyy="{I[1]}" izz="{I[2]}" ixy="0" ixz="0" iyz="0"/></inertial>
+{more}</link>"""
+JOINT = """<joint name="{name}" type="{kind}"><parent link="{a}"/><child link="{b}"/>
+<origin xyz="0 0 -0.4"/><axis xyz="0 1 0"/>
+<limit lower="-3" upper="3" effort="50" velocity="9"/>{more}</joint>"""
+GOOD = (0.02, 0.02, 0.01)
+
+
+def link(name, m=1.0, I=GOOD, more=""):  # noqa: E741
+    return LINK.format(name=name, m=m, I=I, more=more)
+
+
+def joint(name, a, b, kind="revolute", more=""):
+    return JOINT.format(name=name, a=a, b=b, kind=kind, more=more)
+
+
+def robot(folder, *parts, name="arm.urdf"):
+    text = f'<robot name="arm"><link name="base"/>{"".join(parts)}</robot>'
+    path = folder / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    return path
+
+
+def arm(folder, first="", second="", more="", I=GOOD, name="arm.urdf"):  # noqa: E741
+    return robot(
+        folder, link("l1", more=more), link("l2", I=I),
+        joint("j1", "base", "l1", more=first), joint("j2", "l1", "l2", more=second),
+        name=name,
+    )  # fmt: skip
+
+
+def scene_of(folder, path, more=""):
+    scene = folder / "scene.yaml"
+    scene.write_text(
+        f'directives:\n- add_model: {{name: arm, file: "file://{path}"}}\n'
+        "- add_weld: {parent: world, child: arm::base}\nplant: {time_step: 0}\n" + more
+    )
+    return read_scene(scene)
+
+
+def plant_of(folder, path, more=""):
+    return load_scene(scene_of(folder, path, more), DiagramBuilder())
+
+
+def proposal_of(folder, path, names=("j1", "j2")):
+    t = np.arange(0.0, 4.0, 0.01)
+    table = {"time": t}
+    for k, name in enumerate(names):
+        table[f"{name}_pos"] = 0.2 * np.sin((2 + k) * t)
+        table[f"{name}_effort"] = 0.2 * np.cos((2 + k) * t)
+    np.savetxt(folder / "log.csv", np.column_stack(list(table.values())), "%.9g", ",",
+               header=",".join(table), comments="")  # fmt: skip
+    return propose_scene(read_robot(path), [read_log(folder / "log.csv")])
+
+
+def mesh(uri, kind="collision"):
+    return f'<{kind}><geometry><mesh filename="{uri}"/></geometry></{kind}>'
+
+
+def box(path):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    trimesh.creation.box((0.2, 0.4, 0.6)).export(
+        path, file_type=path.suffix.lower()[1:]
+    )
+
+
+@pytest.mark.parametrize("name", ["a box.STL", "box.dae", "box.ply", "box.obj"])
+def test_the_hull_of_a_mesh_of_any_format_is_that_of_its_corners(name, tmp_path):
+    box(tmp_path / name)
+    loaded = plant_of(tmp_path, arm(tmp_path, more=mesh(name)))
+    body = loaded.plant.GetBodyByName("l1")
+    (shape,) = loaded.plant.GetCollisionGeometriesForBody(body)
+    hull = loaded.scene_graph.model_inspector().GetShape(shape).GetConvexHull()
+    corners = np.array([hull.vertex(i) for i in range(hull.num_vertices())])
+    # STL and DAE keep single precision.
+    np.testing.assert_allclose(np.ptp(corners, axis=0), [0.2, 0.4, 0.6], atol=1e-6)
+
+
+def test_a_mesh_in_a_comment_and_one_for_display_stop_nothing(tmp_path):
+    (tmp_path / "broken.stl").write_text("no mesh")
+    more = f"<!-- {mesh('gone.stl')} -->" + mesh("broken.stl", "visual")
+    more += mesh("gone.dae", "visual")
+    plant = plant_of(tmp_path, arm(tmp_path, more=more)).plant
+    assert plant.num_positions() == 2
+    assert not proposal_of(tmp_path, tmp_path / "arm.urdf").copies
+
+
+def test_a_broken_collision_mesh_is_named_and_left_out_of_a_proposal(tmp_path):
+    (tmp_path / "broken.stl").write_text("no mesh")
+    path = arm(tmp_path, more=mesh("broken.stl"))
+    with pytest.raises(ValueError, match="broken.stl cannot be read as a mesh"):
+        plant_of(tmp_path, path)
+    assert list(proposal_of(tmp_path, path).copies) == ["arm_without_meshes.urdf"]
+
+
+def test_packages_are_found_beside_above_and_in_the_paths_of_ros(tmp_path, monkeypatch):
+    uri = "package://own_description/meshes/box.stl"
+    ws = tmp_path / "ws"
+    path = arm(tmp_path, more=mesh(uri), name="ws/bringup/urdf/arm.urdf")
+    with pytest.raises(ValueError, match="package own_description is unknown"):
+        plant_of(tmp_path, path)
+    for k, (where, variable, value) in enumerate(
+        (
+            (ws / "own_description", None, None),  # Beside a folder above.
+            (
+                ws / "bringup",
+                None,
+                None,
+            ),  # Above, by another name: a downloaded archive.
+            (
+                tmp_path / "ros/src/own_description",
+                "ROS_PACKAGE_PATH",
+                tmp_path / "ros",
+            ),
+            (
+                tmp_path / "opt/share/own_description",
+                "AMENT_PREFIX_PATH",
+                tmp_path / "opt",
+            ),
+        )
+    ):
+        os.utime(path, (k, k))  # What was found is kept until the file changes.
+        file = where / "meshes/box.stl"
+        box(file)
+        if variable:
+            monkeypatch.setenv(variable, os.pathsep.join(["/nowhere", str(value)]))
+        assert plant_of(tmp_path, path).plant.num_positions() == 2
+        file.unlink()
+        file.parent.rmdir()
+        if where.name == "own_description":
+            where.rmdir()
+
+
+XACRO = """<robot name="arm" xmlns:xacro="http://www.ros.org/wiki/xacro">
+<xacro:include filename="$(find own_description)/urdf/parts.xacro"/>
+<xacro:property name="mass" value="${2 * 1.5}"/><link name="base"/>
+<xacro:part name="1" parent="base"/><xacro:part name="2" parent="l1"/></robot>"""
+
+
+def test_xacro_is_expanded_with_its_includes(tmp_path):
+    parts = link("l${name}", m="${mass}") + joint("j${name}", "${parent}", "l${name}")
+    folder = tmp_path / "own_description/urdf"
+    folder.mkdir(parents=True)
+    (folder / "parts.xacro").write_text(
+        '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:macro name="part" '
+        f'params="name parent">{parts}</xacro:macro></robot>'
+    )
+    path = folder / "arm.urdf.xacro"
+    path.write_text(XACRO)
+    plant = plant_of(tmp_path, path).plant
+    assert plant.CalcTotalMass(plant.CreateDefaultContext()) == 6.0
+    assert "own_description" in proposal_of(tmp_path, path).scene
+    path.write_text(XACRO.replace("own_description", "nowhere"))
+    with pytest.raises(ValueError, match="xacro says: .*package nowhere is unknown"):
+        read_robot(path)
+
+
+FRICTION = '<dynamics damping="0.3" friction="0.2"/>'
+
+
+def test_friction_of_a_urdf_and_an_sdf_is_an_effect_of_the_scene(tmp_path):
+    path = arm(tmp_path, FRICTION)
+    (effect,) = scene_of(tmp_path, path).effects
+    assert effect.kind == "joint_coulomb_friction" and effect.at == ["arm.j1"]
+    assert effect.parameters == {"coulomb": 0.2}
+    proposal = proposal_of(tmp_path, path)
+    assert "parameters: {coulomb: 0.2}}  # From the file." in proposal.scene
+    # What the scene itself says counts.
+    own = "effects:\n- {kind: joint_coulomb_friction, at: arm, parameters: "
+    (effect,) = scene_of(tmp_path, path, own + "{coulomb: 0.1}}\n").effects
+    assert effect.parameters == {"coulomb": 0.1}
+    assert not scene_of(tmp_path, path, "fixed_joints: {arm.j1: 0}\n").effects
+    sdf = tmp_path / "arm.sdf"
+    inertia = "".join(f"<i{k}>{0.1 if k in ('xx', 'yy', 'zz') else 0}</i{k}>"
+                      for k in ("xx", "xy", "xz", "yy", "yz", "zz"))  # fmt: skip
+    sdf.write_text(
+        "<sdf version='1.9'><model name='arm'><link name='base'/><link name='l1'>"
+        f"<inertial><mass>1</mass><inertia>{inertia}</inertia></inertial></link>"
+        "<joint name='j1' type='revolute'><parent>base</parent><child>l1</child><axis>"
+        "<xyz>0 1 0</xyz><dynamics><friction>0.4</friction></dynamics></axis></joint>"
+        "</model></sdf>"
+    )
+    (effect,) = scene_of(tmp_path, sdf).effects
+    assert effect.parameters == {"coulomb": 0.4}
+
+
+def in_words(scene):
+    return {(e.kind, *e.at): e.parameters for e in scene.effects}
+
+
+def test_an_exported_model_is_read_back_as_the_same_scene(tmp_path):
+    drive = """<transmission type="SimpleTransmission"><joint name="j1"/><actuator
+name="m"/></transmission>"""
+    path = robot(
+        tmp_path, link("l1"), link("l2"), drive, joint("j1", "base", "l1",
+        more=FRICTION), joint("j2", "l1", "l2"),
+    )  # fmt: skip
+    scene = scene_of(tmp_path, path)
+    for name, text in (
+        ("again.urdf", to_urdf(scene, "arm").text), ("again.xml", to_mjcf(scene).text),
+    ):  # fmt: skip
+        (tmp_path / name).write_text(text)
+        again = tmp_path / "again.yaml"
+        weld = "- add_weld: {parent: world, child: arm::base}\n"
+        again.write_text(
+            f'directives:\n- add_model: {{name: arm, file: "{name}"}}\n'
+            + (weld if name.endswith("urdf") else "") + "plant: {time_step: 0}\n"
+        )  # fmt: skip
+        new = read_scene(again)
+        plants = [load_scene(each, DiagramBuilder()).plant for each in (scene, new)]
+        for q in ([0.3, -0.2], [1.2, 0.7]):
+            found = []
+            for plant in plants:
+                context = plant.CreateDefaultContext()
+                plant.SetPositions(context, q)
+                gravity = plant.CalcGravityGeneralizedForces(context)
+                found.append(np.vstack([plant.CalcMassMatrix(context), gravity]))
+            np.testing.assert_allclose(*found, atol=1e-12)
+        values = [list(in_words(each).values()) for each in (scene, new)]
+        assert values[0] == values[1] == [{"coulomb": 0.2}], name
+
+
+def test_what_nobody_uses_is_told_with_what_it_means(tmp_path):
+    more = '<safety_controller k_velocity="9"/><calibration rising="0"/>'
+    gear = (
+        "<transmission><type>transmission_interface/SimpleTransmission</type><joint "
+        "name='j1'/><actuator name='m'><mechanicalReduction>100</mechanicalReduction>"
+        "</actuator></transmission><transmission><joint name='none'/></transmission>"
+    )
+    path = robot(
+        tmp_path, link("l1"), link("l2"), gear, joint("j1", "base", "l1", more=more),
+        joint("j2", "l1", "l2", more='<mimic joint="lost"/>'),
+    )  # fmt: skip
+    notes = "; ".join(proposal_of(tmp_path, path).notes)
+    for words in ("1 <safety_controller> are not used", "1 <calibration> are not",
+                  "mechanicalReduction of j1 100", "drives none, which is no joint",
+                  "j2 follows lost, which is no joint"):  # fmt: skip
+        assert words in notes
+
+
+BAD = (0.001, 0.001, 0.03)
+
+
+def test_all_impossible_inertias_are_listed_at_once_and_repaired(tmp_path):
+    path = robot(
+        tmp_path, link("l1", I=BAD), link("l2", I=(-0.01, 0.02, 0.02)),
+        joint("j1", "base", "l1"), joint("j2", "l1", "l2"),
+    )  # fmt: skip
+    with pytest.raises(ValueError, match="link 'l1' has .*link 'l2' has .*--repair"):
+        plant_of(tmp_path, path)
+    text, changed = repaired(path.read_text())
+    assert len(changed) == 2 and not faults_of(text)
+    (tmp_path / "new.urdf").write_text(text)
+    assert plant_of(tmp_path, tmp_path / "new.urdf").plant.num_positions() == 2
+
+
+def test_what_is_fixed_together_counts_together(tmp_path):
+    """The mass matrix is that of the numbers in the file, as for one body."""
+    fixed = joint("f", "l2", "camera", kind="fixed")
+    path = robot(
+        tmp_path, link("l1"), link("l2"), link("camera", m=0.1, I=(0, 0, 3e-3)), fixed,
+        joint("j1", "base", "l1"), joint("j2", "l1", "l2"),
+    )  # fmt: skip
+    plant = plant_of(tmp_path, path).plant
+    M = plant.CalcMassMatrix(plant.CreateDefaultContext())
+    # About j2: both central moments about y, and m r^2: 0.2 m, and 0.4 + 0.2 m.
+    expected = 0.02 + 0.0 + 1.0 * 0.2**2 + 0.1 * 0.6**2
+    assert M[1, 1] == pytest.approx(expected, rel=1e-12)
+
+
+def test_a_bad_inertia_that_does_not_move_is_no_defect(tmp_path):
+    path = robot(
+        tmp_path, link("foot", I=BAD), joint("f", "base", "foot", kind="fixed"),
+        link("l1"), joint("j1", "base", "l1"), link("l2", I=BAD),
+        joint("j2", "l1", "l2"),
+    )  # fmt: skip
+    with pytest.raises(ValueError) as error:
+        plant_of(tmp_path, path)
+    assert "l2" in str(error.value) and "foot" not in str(error.value)
+    # Of a joint that the log has no column of nothing is moved, either.
+    names = ("j1",)
+    fixed = proposal_of(tmp_path, path, names).scene
+    (tmp_path / "fixed.yaml").write_text(fixed)
+    assert load_scene(tmp_path / "fixed.yaml", DiagramBuilder()).plant
+
+
+def test_rounding_is_no_fault():
+    for moments in ((-2e-22, 1e-6, 1e-6), (1e-20, -5e-20, 0.0), (0.01, 0.02, 0.03)):
+        assert fault_of(Inertial(1.0, np.zeros(3), np.diag(moments))) == ""
+
+
+PACKAGE = Path(trimesh.__file__).parents[1] / (
+    "cmeel.prefix/share/example-robot-data/robots"
+)
+# Of links that move: more than the two others together, or negative.
+IMPOSSIBLE = {"alex_psyonic_hands", "allegro_left_hand", "allegro_right_hand",
+              "romeo_laas_small", "romeo_small"}  # fmt: skip
+NO_JOINT = {"quadrotor_base", "iris_simple"}
+
+
+@pytest.mark.slow
+def test_public_urdfs_are_accepted_or_refused_for_their_defect(tmp_path):
+    """Each with a log of all its joints, as `makebreak gap ROBOT LOG` takes it."""
+    if not PACKAGE.is_dir():
+        pytest.skip("example-robot-data is not installed (extra `meshes`)")
+    refused = {}
+    files = sorted(PACKAGE.rglob("*.urdf"))
+    for path in files:
+        try:
+            own = read_robot(path)
+            names = [j.name.partition(".")[2] for j in own.joints]
+            proposal = proposal_of(tmp_path, path, names)
+            for name, text in proposal.copies.items():
+                (tmp_path / name).write_text(text)
+            (tmp_path / "proposed.yaml").write_text(proposal.scene)
+            load_scene(tmp_path / "proposed.yaml", DiagramBuilder())
+        except ValueError as error:
+            refused[path.stem] = str(error)
+    assert set(refused) == IMPOSSIBLE | NO_JOINT | {"ur3"}
+    for name, message in refused.items():
+        expected = "central moments" if name in IMPOSSIBLE else (
+            "no joint that turns" if name in NO_JOINT else "has no <link>"
+        )  # fmt: skip
+        assert expected in message
+    assert len(files) - len(refused) == 61
