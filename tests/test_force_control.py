@@ -17,6 +17,7 @@ from makebreak.systems.arm.impedance_controller import (
     ImpedanceController,
     serial_chain_of,
 )
+from makebreak.systems.arm.numerics.energy_tank import N_TANK
 from makebreak.systems.arm.numerics.impedance_controller import (
     ACTIVE,
     DAMPING,
@@ -382,7 +383,7 @@ def test_motion_is_projected_and_the_push_added(law, chain):
         N_T = np.eye(7) - s.J.T @ Lambda @ s.J @ M_inv
         damped = s.J.T @ np.linalg.inv(s.J @ s.J.T + 0.02**2 * np.eye(6))
         expected = s.J.T @ F + s.bias + N_T @ s.M @ (20.0 * (damped @ twist - v))
-        tau, _ = impedance_torque(*args, K, D, 0.0, W, slots)
+        tau, _ = impedance_torque(*args, K, D, 0.0, W, slots, np.zeros(N_TANK), 0.0)
         np.testing.assert_allclose(tau, expected, rtol=1e-5, atol=1e-5)
 
 
@@ -401,8 +402,9 @@ def test_damping_rule_is_the_critical_one_times_its_ratio(law, chain, ratio):
         np.testing.assert_allclose(-pole.real / abs(pole), ratio, rtol=1e-9)
     args = (chain, law, q, v, q, reference(), np.eye(3), K)
     slots = np.zeros((N_SLOTS, SLOT))
-    by_rule, _ = impedance_torque(*args, K, ratio, np.zeros(6), slots)
-    by_hand, _ = impedance_torque(*args, D, 0.0, np.zeros(6), slots)
+    rest = (np.zeros(6), slots)
+    by_rule, _ = impedance_torque(*args, K, ratio, *rest, np.zeros(N_TANK), 0.0)
+    by_hand, _ = impedance_torque(*args, D, 0.0, *rest, np.zeros(N_TANK), 0.0)
     np.testing.assert_allclose(by_rule, by_hand, rtol=1e-6, atol=1e-6)
 
 

@@ -28,6 +28,7 @@ from makebreak.systems.arm.impedance_controller import (
     ImpedanceController,
     serial_chain_of,
 )
+from makebreak.systems.arm.numerics.energy_tank import N_TANK
 from makebreak.systems.arm.numerics.impedance_controller import (
     N_SLOTS,
     REFERENCE_HELD,
@@ -51,7 +52,6 @@ from makebreak.systems.arm.numerics.serial_chain import chain_state, tip_kinemat
 EFFORT = np.repeat([87.0, 12.0], [4, 3])
 NO_NOISE = SensorNoise(0.0, 0.0, 0.0, 0.0, 0.0)
 P_TIP = np.array([0.5, 0.0, 0.1])
-NO_SLOTS = np.zeros((N_SLOTS, SLOT))
 # Directions, targets, measured wrench; delay.
 NO_FORCE = (np.zeros(6), np.zeros(2), np.zeros(6), 0.0)
 
@@ -69,6 +69,11 @@ def law(plant):
 @pytest.fixture(scope="module")
 def chain(plant):
     return serial_chain_of(plant, "tip")
+
+
+def unused():
+    """No slots under force control, a tank without a past, no lag."""
+    return np.zeros((N_SLOTS, SLOT)), np.zeros(N_TANK), 0.0
 
 
 def reference(p=P_TIP, v=(0, 0, 0), a=(0, 0, 0), quaternion=(1, 0, 0, 0)):
@@ -220,7 +225,7 @@ def test_torque_is_the_law_written_out(law, chain, control_orientation):
         N_T = np.eye(7) - J.T @ Lambda @ J @ M_inv
         expected = J.T @ F + s.bias + N_T @ s.M @ qdd
         tau, p = impedance_torque(
-            chain, law, q, v, q_n, x_d, R_d, K, D, 0.0, wrench, NO_SLOTS
+            chain, law, q, v, q_n, x_d, R_d, K, D, 0.0, wrench, *unused()
         )
         np.testing.assert_allclose(p, s.p_WE)
         # Lambda is regularised by 1e-9 of its inverse's size.
@@ -235,9 +240,10 @@ def test_posture_never_accelerates_the_task(law, chain, control_orientation):
     for q, v in random_states(10):
         s = chain_state(chain, q, v)
         x_d = reference()
-        args = (x_d, np.eye(3), law.stiffness, law.damping, 0.0, np.zeros(6), NO_SLOTS)
+        args = (x_d, np.eye(3), law.stiffness, law.damping, 0.0, np.zeros(6))
         tau = [
-            impedance_torque(chain, law, q, v, q_n, *args)[0] for q_n in (q, q + 0.5)
+            impedance_torque(chain, law, q, v, q_n, *args, *unused())[0]
+            for q_n in (q, q + 0.5)
         ]
         assert np.abs(tau[1] - tau[0]).max() > 1.0
         change = s.J[:m] @ np.linalg.solve(s.M, tau[1] - tau[0])
@@ -262,7 +268,18 @@ def test_rotational_gains_are_lessened_where_the_wrist_is_light(law, chain):
         at_v = chain_state(light, q, v)
         x_d = reference(s.p_WE)
         tau, _ = impedance_torque(
-            light, law, q, v, q, x_d, s.R_WE, np.zeros(6), D, 0.0, np.zeros(6), NO_SLOTS
+            light,
+            law,
+            q,
+            v,
+            q,
+            x_d,
+            s.R_WE,
+            np.zeros(6),
+            D,
+            0.0,
+            np.zeros(6),
+            *unused(),
         )
         v_next = v + 1e-3 * np.linalg.solve(at_v.M, tau - at_v.bias)
         assert (s.J[3:] @ v_next) @ w > 0.0
@@ -540,10 +557,10 @@ def test_spring_and_damper_push_no_harder_than_force_max(law, chain):
     away = np.array([0.3, -0.2, 0.6])
     limited = law._replace(force_max=15.0)
     args = (q, still, q, reference(s.p_WE + away), s.R_WE, law.stiffness, law.damping)
-    tau, _ = impedance_torque(chain, limited, *args, 0.0, np.zeros(6), NO_SLOTS)
+    tau, _ = impedance_torque(chain, limited, *args, 0.0, np.zeros(6), *unused())
     free, _ = impedance_torque(
         chain, limited, q, still, q, reference(s.p_WE), s.R_WE, law.stiffness,
-        law.damping, 0.0, np.zeros(6), NO_SLOTS,
+        law.damping, 0.0, np.zeros(6), *unused(),
     )  # fmt: skip
     expected = s.J[:3].T @ (15.0 * away / np.linalg.norm(away))
     np.testing.assert_allclose(tau - free, expected, atol=1e-9)

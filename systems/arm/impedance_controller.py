@@ -39,6 +39,9 @@ class ImpedanceConfig:
     # posture keeps the tool upright.
     control_orientation: bool = False
     force_max: float = math.inf  # Largest force of spring and damper together [N].
+    # Energy that rises of a variable stiffness may take before the damping has taken
+    # out more [J]; inf: any, the stiffness is used as it is asked for.
+    energy_tank: float = 0.05
     # Stiffness of the posture, in the null space, per unit of inertia [1/s2].
     posture_stiffness: float = 100.0
     # Damping of the posture, in the null space, per unit of inertia [1/s].
@@ -144,7 +147,7 @@ class ImpedanceController(LeafSystem):
             gains = np.asarray(getattr(config, name), dtype=float)
             if gains.shape != (6,) or not np.all(gains >= 0.0):
                 raise ValueError(f"{name} is {gains}, expected 6 numbers of 0 or more")
-        for name in ("posture_stiffness", "posture_damping"):
+        for name in ("energy_tank", "posture_stiffness", "posture_damping"):
             if not getattr(config, name) >= 0.0:
                 raise ValueError(f"{name} is {getattr(config, name)}, expected >= 0")
         for name, number in (
@@ -175,6 +178,7 @@ class ImpedanceController(LeafSystem):
             stiffness=np.array(config.stiffness, dtype=float),
             damping=np.array(config.damping, dtype=float),
             force_max=float(config.force_max),
+            tank=float(config.energy_tank),
             posture_stiffness=float(config.posture_stiffness),
             posture_damping=float(config.posture_damping),
             posture_every=max(1, round(0.012 / config.period_sec)),

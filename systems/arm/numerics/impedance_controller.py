@@ -25,6 +25,7 @@ from makebreak.systems.arm.numerics.cholesky import (
     cholesky_solve,
     forward_solve,
 )
+from makebreak.systems.arm.numerics.energy_tank import N_TANK, fill, paid_stiffness
 from makebreak.systems.arm.numerics.joint_limits import (
     braked,
     is_free,
@@ -90,6 +91,7 @@ class Law(NamedTuple):
     stiffness: np.ndarray  # (6,) [N/m] x 3, [N m/rad] x 3
     damping: np.ndarray  # (6,) [N s/m] x 3, [N m s/rad] x 3
     force_max: float  # Of spring and damper together [N].
+    tank: float  # Energy that rises of the stiffness may take [J], infinite for any.
     posture_stiffness: float  # k_q [1/s2]
     posture_damping: float  # k_v [1/s]
     posture_every: int  # Ticks between two steps of the posture.
@@ -101,10 +103,10 @@ class Law(NamedTuple):
 def memory_size(n: int) -> int:
     """Size of the memory: [q_n, last good q, last good pose (7), ticks, has a good
     pose, has a good q, last good force directions (6) and targets (2), slots (N_SLOTS x
-    SLOT), last v].
+    SLOT), energy tank (N_TANK), last v].
 
     While a sensor is held, q and v are predictions (held_motion)."""
-    return 3 * n + 18 + N_SLOTS * SLOT
+    return 3 * n + 18 + N_SLOTS * SLOT + N_TANK
 
 
 @numba.njit(cache=True)
@@ -257,8 +259,25 @@ def force_control(law, slots, directions, targets, measured):
 
 
 @numba.njit(cache=True)
+def _under_motion_control(slots, scale, motion):
+    """The part of an error, or its rate, on which spring and damper act: (m,) whose
+    square times K is that of S K.
+
+    Args: slots (N_SLOTS, SLOT); scale: of the gains about the axes; motion (m,).
+    """
+    out = motion.copy()
+    out[3:] *= np.sqrt(scale)
+    for j in range(slots.shape[0]):
+        if slots[j, WEIGHT] > 0.0:
+            n_j = slots[j, :3]
+            along = np.sum(n_j * out[:3])
+            out[:3] -= (1.0 - np.sqrt(1.0 - slots[j, WEIGHT])) * along * n_j
+    return out
+
+
+@numba.njit(cache=True)
 def impedance_torque(
-    chain, law, q, v, q_n, x_d, R_d, stiffness, damping, ratio, wrench, slots
+    chain, law, q, v, q_n, x_d, R_d, stiffness, damping, ratio, wrench, slots, tank, lag
 ):
     """The control law, without limits.
 
@@ -268,7 +287,8 @@ def impedance_torque(
         `damping` is the stiffness from which D along each axis is computed,
         D = 2 ratio sqrt(damping lambda), lambda = 1/(J inv(M) J')_ii. wrench (6,): fed
         forward, force first [N], [N m]. slots (N_SLOTS, SLOT) of force_control; their
-        filtered speeds are updated.
+        filtered speeds are updated. tank (N_TANK,) of energy_tank, updated. lag: from a
+        reading to the middle of the time for which its torque acts [s].
     Returns: tau (n,) [N m] and the tip's position p_WE (3,) [m].
     """
     n = q.shape[0]
@@ -301,22 +321,30 @@ def impedance_torque(
         for i in range(m):
             damping[i] = 2.0 * ratio * np.sqrt(damping[i] / mobility[i, i])
     twist = J @ v
-    F = np.empty(m)
-    F[:3] = stiffness[:3] * (x_d[:3] - s.p_WE) + damping[:3] * (x_d[7:10] - twist[:3])
-    pushing = np.sqrt(np.sum(F[:3] ** 2))
-    if pushing > law.force_max:
-        F[:3] *= law.force_max / pushing
+    error, rate = np.empty(m), np.empty(m)
+    error[:3], rate[:3] = x_d[:3] - s.p_WE, x_d[7:10] - twist[:3]
     a_ref = np.empty(m)
     a_ref[:3] = x_d[13:16]
+    scale = 1.0  # Of stiffness and damping about the axes.
     if m == 6:
         # Explicit damping d is stable while d period < inertia. The wrist's inertia may
         # be small: then stiffness and damping are reduced together.
         turning = mobility[3, 3] + mobility[4, 4] + mobility[5, 5]
         most = max(damping[3], damping[4], damping[5]) * turning * law.period
         scale = 1.0 if most < 0.5 else 0.5 / most
-        turn = rotation_error(R_d, s.R_WE)
-        F[3:] = scale * (stiffness[3:] * turn + damping[3:] * (x_d[10:13] - twist[3:]))
+        error[3:] = rotation_error(R_d, s.R_WE)
+        rate[3:] = x_d[10:13] - twist[3:]
         a_ref[3:] = x_d[16:19]
+    stored = _under_motion_control(slots, scale, error)
+    stiffness = paid_stiffness(tank, stiffness, stored, law.tank)
+    lost = _under_motion_control(slots, scale, rate)
+    F = stiffness[:m] * error + damping[:m] * rate
+    pushing = np.sqrt(np.sum(F[:3] ** 2))
+    if pushing > law.force_max:
+        F[:3] *= law.force_max / pushing
+        lost[:3] *= np.sqrt(law.force_max / pushing)
+    fill(tank, damping, lost, lag, law.period, law.tank)
+    F[3:] *= scale
     for j in range(slots.shape[0]):
         weight = slots[j, WEIGHT]
         if weight > 0.0:  # Motion control only across n; along n the push.
@@ -442,7 +470,7 @@ def tick(
     if not np.all(np.isfinite(measured)):
         measured = np.zeros(6)  # Below CONTACT_FORCE_MIN: freezes the integral.
         status |= FORCE_SENSOR_HELD
-    slots = memory[2 * n + 18 : -n].reshape(N_SLOTS, SLOT)
+    slots = memory[2 * n + 18 : -n - N_TANK].reshape(N_SLOTS, SLOT)
 
     if sensed:
         force_control(law, slots, kept[:6], kept[6:], measured)
@@ -459,6 +487,8 @@ def tick(
             ratio,
             wrench,
             slots,
+            memory[-n - N_TANK : -n],
+            delay + 0.5 * law.period,
         )
         if count % law.posture_every == 0:
             memory[:n] = posture_step(chain, law, memory[:n].copy(), p_tip)
