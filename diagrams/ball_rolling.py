@@ -54,6 +54,7 @@ from makebreak.diagrams.station import (
     TIP_FRAME,
     TOOL,
     StationConfig,
+    control_laws,
     make_control_plant,
     make_station,
 )
@@ -260,6 +261,7 @@ def add_ball_rolling(
             arm,
             TIP_FRAME,
             hybrid=hybrid,
+            laws=control_laws(model_scene, arm),
         ),
     )
 

@@ -37,6 +37,7 @@ from makebreak.diagrams.station import (
     SensorNoise,
     StationConfig,
     StationFaults,
+    control_laws,
     make_control_plant,
     make_station,
 )
@@ -264,7 +265,9 @@ def make_changing_contact(
         ),
     )
     arm = make_control_plant(model, tool)
-    systems = _add_systems(builder, config, arm, pattern, knowledge or Knowledge())
+    laws = control_laws(model, arm, tool)
+    known = knowledge or Knowledge()
+    systems = _add_systems(builder, config, arm, laws, pattern, known)
     _connect_systems(builder, station, systems, config)
     tau = systems.impedance.GetOutputPort("tau")
     record_station(builder, station, tau, tool)
@@ -302,7 +305,12 @@ class _Systems:
 
 
 def _add_systems(
-    builder: DiagramBuilder, config, arm: MultibodyPlant, pattern, known: Knowledge
+    builder: DiagramBuilder,
+    config,
+    arm: MultibodyPlant,
+    laws,
+    pattern,
+    known: Knowledge,
 ) -> _Systems:
     # The approach speed of the anticipator depends on how hard the reflex brakes.
     own = ("reflex_gain", "reflex_force_least", "reflex_force_known")
@@ -361,6 +369,7 @@ def _add_systems(
                 arm,
                 TIP_FRAME,
                 hybrid=config.hybrid,
+                laws=laws,
             ),
         ),
     )

@@ -63,6 +63,7 @@ from makebreak.diagrams.station import (
     TOOL,
     StationConfig,
     StationFaults,
+    control_laws,
     from_wrist,
     make_control_plant,
     make_station,
@@ -452,6 +453,7 @@ def _add_arm_control(
             ),
             model.arm,
             TIP_FRAME,
+            laws=control_laws(model_arm_scene(config), model.arm),
         ),
     )
     return reference, impedance

@@ -24,19 +24,23 @@ from makebreak.diagrams.realism import StationErrors, with_errors
 from makebreak.diagrams.scene_facts import actuators_of
 from makebreak.diagrams.wiring import add_generalized_forces
 from makebreak.models.effects import KINDS
+from makebreak.models.effects.kind import Effect
 from makebreak.models.model_files import MODELS
 from makebreak.models.scene import (
     InitialSection,
     LoadedScene,
     Scene,
+    joint_laws,
     load_scene,
     read_scene,
 )
+from makebreak.models.scene_schema import as_kind
 from makebreak.systems.arm.impedance_controller import serial_chain_of
 from makebreak.systems.arm.tool_wrench import ToolWrench
 from makebreak.systems.faults.fault_forces import BodyForce
 from makebreak.systems.faults.fault_signals import LateSignal
 from makebreak.systems.faults.safety_monitor import ArmLimits, SafetyMonitor
+from makebreak.systems.numerics.joint_laws import JointLaws
 from makebreak.systems.perception.noisy_sensor import (
     DriftingSensor,
     LateSensor,
@@ -401,8 +405,8 @@ def make_control_plant(
     """The controllers' own model of the arm with its tool: the scene without the rest.
 
     Its default positions are the scene's initial ones. It has the scene's effects on
-    arm, tool and world, except effects with hidden states, which are not measured, and
-    damping, as the impedance controller does not compensate friction.
+    arm, tool and world, except effects with hidden states, which are not measured; laws
+    of the joints, such as dry friction, are not in the plant, but in control_laws.
     """
     if not isinstance(scene, Scene):
         scene = read_scene(scene)
@@ -420,24 +424,37 @@ def make_control_plant(
             if name.split(".")[0] in own
         }
     )
-    effects = [
-        effect
-        for effect in scene.effects
-        if all(
-            at.split(".")[0].split("~")[0] in (*own, "world") and "~" not in at
-            for at in effect.at
-        )
-        and not (effect.kind in KINDS and KINDS[effect.kind].hidden_state)
-        and effect.kind != "joint_viscous_damping"
-    ]
     part = replace(
         scene,
         directives=directives,
         initial=initial,
-        effects=effects,
+        effects=_own_effects(scene, tool),
         friction_zones=[],
     )
     return load_scene(part, DiagramBuilder()).plant
+
+
+def _own_effects(scene: Scene, tool: str) -> list[Effect]:
+    """Effects on arm, tool and world, except those with hidden states."""
+    return [
+        effect
+        for effect in scene.effects
+        if all(
+            at.split(".")[0].split("~")[0] in (ARM, tool, "world") and "~" not in at
+            for at in effect.at
+        )
+        and not (effect.kind in KINDS and KINDS[effect.kind].hidden_state)
+    ]
+
+
+def control_laws(
+    scene: Scene | str | Path, plant: MultibodyPlant, tool: str = TOOL
+) -> JointLaws:
+    """The forces in the arm's joints that the scene has beside the damping of `plant`,
+    its make_control_plant: what the impedance controller compensates too."""
+    if not isinstance(scene, Scene):
+        scene = read_scene(scene)
+    return joint_laws([as_kind(e) for e in _own_effects(scene, tool)], plant)
 
 
 def from_wrist(arm: MultibodyPlant) -> np.ndarray:

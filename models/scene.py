@@ -80,6 +80,7 @@ from makebreak.models.scene_schema import (
     check_scene,
 )
 from makebreak.models.typed_yaml import nearest, one_line
+from makebreak.systems.numerics.joint_laws import LAWS, JointLaws
 
 __all__ = [
     "CHANNEL_STEPS",
@@ -396,6 +397,27 @@ def _joint_numbers(plant: MultibodyPlant, effects: Sequence[Effect]) -> list:
         if kind.joint_law is not None and kind.joint_numbers is not None
         for joint in find_joints(effect, plant)
     ]
+
+
+def joint_laws(effects: Sequence[Effect], plant: MultibodyPlant) -> JointLaws:
+    """The forces of effects on joints that are laws of the joint's own motion: dry
+    friction, quadratic drag, ripple and springs.
+
+    Args: plant: finalized, in which each joint has one velocity per position.
+    """
+    rows = [
+        (joint.velocity_start(), LAWS.index(kind.joint_law), numbers)
+        for effect in effects
+        for kind in [KINDS[effect.kind]]
+        if kind.joint_law is not None and kind.joint_numbers is not None
+        for joint in find_joints(effect, plant)
+        for numbers in [kind.joint_numbers(effect, plant, joint)]
+    ]
+    p = np.zeros((len(rows), 4))
+    for row, (_, _, numbers) in zip(p, rows, strict=True):
+        row[: len(numbers)] = numbers
+    joint, kind = ([row[k] for row in rows] for k in (0, 1))
+    return JointLaws(np.array(joint, np.int64), np.array(kind, np.int64), p)
 
 
 def _body_numbers(plant: MultibodyPlant, effects: Sequence[Effect]) -> list:

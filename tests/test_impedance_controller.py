@@ -691,7 +691,7 @@ def test_plants_that_are_no_arm_are_refused(plant):
     ball = MultibodyPlant(0.0)
     Parser(ball).AddModels(str(MODELS / "ball.sdf"))
     ball.Finalize()
-    with pytest.raises(ValueError, match="is not revolute"):
+    with pytest.raises(ValueError, match="is quaternion_floating"):
         ImpedanceController(ImpedanceConfig(), ball, "ball")
     with pytest.raises(ValueError, match="torque_rate_max is 0"):
         ImpedanceController(ImpedanceConfig(), plant, torque_rate_max=0.0)

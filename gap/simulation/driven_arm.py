@@ -37,16 +37,14 @@ from makebreak.models.effects.actuation_path import (
 )
 from makebreak.models.effects.kind import (
     Effect,
-    find_joints,
     full_name,
     model_names,
     one_dof_joints,
     velocity_unit,
 )
 from makebreak.models.effects.measured_channels import ChannelMap, channel_maps
-from makebreak.models.scene import Scene, load_scene
+from makebreak.models.scene import Scene, joint_laws, load_scene
 from makebreak.models.scene_schema import COMMANDS_OF, as_kind
-from makebreak.systems.numerics.joint_laws import LAWS
 
 _MOST_KEPT = 64  # Plants whose numbers are remembered.
 
@@ -145,23 +143,10 @@ class DrivenArmScene:
                         law[i, 0] = 0.0
                     else:
                         self._step[i] = own.resolution
-        forces: list[tuple[int, int, list[float]]] = []
-        for effect in effects:
-            kind = KINDS[effect.kind]
-            if kind.joint_law is None or kind.joint_numbers is None:
-                continue
-            for joint in find_joints(effect, plant):
-                p = kind.joint_numbers(effect, plant, joint)
-                number = LAWS.index(kind.joint_law)
-                forces.append((joint.velocity_start(), number, p))
-        law_p = np.zeros((len(forces), 4))
-        for row, (_, _, p) in zip(law_p, forces, strict=True):
-            row[: len(p)] = p
+        forces = joint_laws(effects, plant)
         return dict(
             driven=driven, law=law, path=path, slow=slow, most=most,
-            law_joint=np.array([i for i, _, _ in forces], dtype=np.int64),
-            law_kind=np.array([k for _, k, _ in forces], dtype=np.int64),
-            law_p=law_p,
+            law_joint=forces.joint, law_kind=forces.kind, law_p=forces.p,
         )  # fmt: skip
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import JointActuator, RevoluteJoint
+from pydrake.multibody.tree import JointActuator, PrismaticJoint, RevoluteJoint
 from pydrake.systems.framework import Context, LeafSystem
 
 from makebreak.systems.arm.numerics.impedance_controller import (
@@ -16,15 +16,18 @@ from makebreak.systems.arm.numerics.impedance_controller import (
     packed_tick,
     warm_up,
 )
+from makebreak.systems.arm.numerics.joint_friction import to_compensate
 from makebreak.systems.arm.numerics.packed import packed
 from makebreak.systems.arm.numerics.serial_chain import SerialChain, chain_state
 from makebreak.systems.numerics.first_calls import first_call
+from makebreak.systems.numerics.joint_laws import JointLaws
 from makebreak.systems.numerics.settings import check_settings
 from makebreak.systems.numerics.timing import timed
 
 # Largest damping over (mass of the tip / delay). Damping alone is unstable above pi/2;
 # a third of that leaves a margin for the spring.
 DELAY_DAMPING_MAX = 0.5
+NO_LAWS = JointLaws(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 4)))
 
 
 @dataclass
@@ -41,7 +44,7 @@ class ImpedanceConfig:
     force_max: float = math.inf  # Largest force of spring and damper together [N].
     # Energy that rises of a variable stiffness may take before the damping has taken
     # out more [J]; inf: any, the stiffness is used as it is asked for.
-    energy_tank: float = 0.05
+    energy_tank: float = 0.02
     # Stiffness of the posture, in the null space, per unit of inertia [1/s2].
     posture_stiffness: float = 100.0
     # Damping of the posture, in the null space, per unit of inertia [1/s].
@@ -81,14 +84,19 @@ class ImpedanceController(LeafSystem):
     K (x_d - x) + D (v_d - v) is shortened to force_max. Two directions that are not
     orthogonal are made so, keeping the first one. F_c rises in ramp_sec;
     D_n >= F_c / closing_speed bounds the speed at which a lost contact is closed again.
-    The integral is frozen while less than 0.5 N is measured, and kept if the next
-    segment has (nearly) the same n. A dropped n fades out over release_sec while the
-    stiffness along it returns.
+    Where less than 0.5 N is measured for 0.2 s, the integral brings the tip back, no
+    faster than closing_speed. It is kept if the next segment has (nearly) the same
+    n. A dropped n fades out over release_sec while the stiffness along it returns.
 
     With `control_orientation` False the task is the tip's position; the posture keeps
     the tool's orientation as at the control plant's default positions. With True the
     task is the full pose.
-    tau is the motors' torque: the mass matrix contains the rotors' inertia.
+    tau is the motors' torque: the mass matrix contains the rotors' inertia, and bias
+    the plant's joint damping. Dry friction and other forces in the joints are
+    compensated by `laws` (numerics/joint_friction.py).
+
+    A variable stiffness rises only as far as an energy tank can pay for it
+    (numerics/energy_tank.py); its level is in the Context.
 
     tau stays within the effort limits of the control plant and changes by at most
     torque_rate_max x period per tick. Near the control plant's limits of joint speeds
@@ -119,10 +127,11 @@ class ImpedanceController(LeafSystem):
              reached, 16 wrench not used, 32 a joint braked at its speed or range.
 
     Args: config; plant: finalized, the arm with its tool alone, never the simulated
-        one; tip_frame: name of E; torque_rate_max [N m/s]; hybrid: settings of force
-        control and damping.
-    Raises: ValueError for a plant that is not one chain of revolute joints with a motor
-        each, or a setting out of range.
+        one; tip_frame: name of E; torque_rate_max [N m/s], of a prismatic joint [N/s];
+        hybrid: settings of force control and damping; laws: forces in the arm's joints
+        beside the plant's own damping, which are compensated too.
+    Raises: ValueError for a plant that is not one chain of revolute and prismatic
+        joints with a motor each, or a setting out of range.
     """
 
     def __init__(
@@ -132,6 +141,7 @@ class ImpedanceController(LeafSystem):
         tip_frame: str = "tip",
         torque_rate_max: float = 1000.0,
         hybrid: HybridConfig | None = None,
+        laws: JointLaws | None = None,
     ):
         super().__init__()
         check_settings(config)
@@ -193,6 +203,7 @@ class ImpedanceController(LeafSystem):
                 release_sec=float(hybrid.release_sec),
                 speed_keep=float(np.exp(-config.period_sec / SPEED_FILTER_SEC)),
             ),
+            laws=to_compensate(laws or NO_LAWS),
         )
         self._ratio = float(hybrid.damping_ratio)
         self._packed = packed(self._chain), packed(self._law)
@@ -218,6 +229,7 @@ class ImpedanceController(LeafSystem):
         self._status = self.DeclareDiscreteState(1)
         self._memory = self.DeclareDiscreteState(memory_size(n))
         self._none, self._no_targets = np.zeros(6), np.zeros(2)
+        self._no_wrench = np.zeros(0)
         self.DeclareStateOutputPort("tau", self._tau)
         self.DeclareStateOutputPort("status", self._status)
         self.DeclarePeriodicDiscreteUpdateEvent(
@@ -251,11 +263,11 @@ class ImpedanceController(LeafSystem):
             most = DELAY_DAMPING_MAX * self._mass / delay
             damping[:3] = np.minimum(damping[:3], most)
         directions, targets = self._none, self._no_targets
-        measured = self._none
+        measured = self._no_wrench
         if self._directions.HasValue(context):  # Otherwise there is no force control.
             directions = self._directions.Eval(context)
             targets = self._or(self._targets, context, self._no_targets)
-            measured = self._or(self._measured, context, self._none)
+            measured = self._or(self._measured, context, self._no_wrench)
         tau, status, memory = packed_tick(
             *self._packed,
             context.get_discrete_state(self._tau).value(),
@@ -296,7 +308,8 @@ def _motors(plant: MultibodyPlant) -> list[JointActuator]:
 
 
 def serial_chain_of(plant: MultibodyPlant, tip_frame: str) -> SerialChain:
-    """The constants of an arm: one chain of revolute joints with a motor each.
+    """The constants of an arm: one chain of revolute and prismatic joints with a motor
+    each.
 
     Args: plant: finalized; tip_frame: name of a frame on the last link or on a body
         welded to it.
@@ -314,14 +327,15 @@ def serial_chain_of(plant: MultibodyPlant, tip_frame: str) -> SerialChain:
     before = [plant.GetBodiesWeldedTo(plant.world_body()), *welded_to[:-1]]
     for joint, parents in zip(moving, before, strict=True):
         name = joint.name()
-        if not isinstance(joint, RevoluteJoint):
-            raise ValueError(f"joint {name!r} is not revolute; the law needs an arm")
+        if not isinstance(joint, RevoluteJoint | PrismaticJoint):
+            raise ValueError(
+                f"joint {name!r} is {joint.type_name()}, expected a revolute or "
+                "prismatic one; the law needs an arm"
+            )
         if joint.parent_body() not in parents:
             raise ValueError(f"joint {name!r} does not continue the chain before it")
         if joint.index() not in motor_of:
             raise ValueError(f"joint {name!r} has no actuator")
-        if joint.default_damping() != 0.0:
-            raise ValueError(f"joint {name!r} has damping; the law does not know it")
     if not moving:
         raise ValueError("the control plant has no joint that moves")
     if not plant.HasFrameNamed(tip_frame):
@@ -354,11 +368,20 @@ def serial_chain_of(plant: MultibodyPlant, tip_frame: str) -> SerialChain:
     return SerialChain(
         R_PJ=np.array(R_PJ),
         p_PJ=np.array(p_PJ),
-        axis=np.array([joint.revolute_axis() for joint in moving]),
+        slides=np.array([int(isinstance(j, PrismaticJoint)) for j in moving]),
+        axis=np.array(
+            [
+                joint.translation_axis()
+                if isinstance(joint, PrismaticJoint)
+                else joint.revolute_axis()
+                for joint in moving
+            ]
+        ),
         mass=np.array(mass),
         p_com=np.array(p_com),
         I_com=np.array(I_com),
         rotor=np.array(rotor),
+        damping=np.array([joint.default_damping() for joint in moving]),
         gravity=np.array(plant.gravity_field().gravity_vector(), dtype=float),
         R_LE=np.ascontiguousarray(X_LE.rotation().matrix()),
         p_LE=np.array(X_LE.translation()),

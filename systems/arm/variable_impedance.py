@@ -65,7 +65,8 @@ class VariableImpedanceConfig:
 
 class VariableImpedance(LeafSystem):
     """Stiffness, damping and feed-forward of the base controller, the transition-phase
-    controllers, and the blend of both.
+    controllers, and the blend of both. This is what is asked for: ImpedanceController
+    lets the stiffness rise as far as its energy tank can pay for it.
 
     Inputs:  prediction_error (1,) [N]; wrench_predicted (6,): on the tool [N], [N m];
              collecting (1,): 1 while the mode detector collects a batch; phase (6,) of

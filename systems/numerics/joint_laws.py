@@ -5,8 +5,10 @@ velocity, the time and up to four parameters p.
 """
 
 import math
+from typing import NamedTuple
 
 import numba
+import numpy as np
 
 
 @numba.njit(cache=True)
@@ -64,3 +66,11 @@ def law_number(number, q, v, t, p):
     if number == 4:
         return ripple_law(q, v, t, p)
     return spring_law(q, v, t, p)
+
+
+class JointLaws(NamedTuple):
+    """Such forces on a mechanism's joints."""
+
+    joint: np.ndarray  # (m,) int: index of the joint's position and velocity.
+    kind: np.ndarray  # (m,) int: number in LAWS.
+    p: np.ndarray  # (m, 4)

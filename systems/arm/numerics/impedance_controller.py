@@ -6,7 +6,8 @@
     S = I - sum n n',  f_fc = sum n (F_c + k_i integral (F_c - F) dt - D_n n' v)
 
 with none, one or two directions n along which force instead of motion is controlled. M
-is the mass matrix with the motors' rotors, so tau is the motors' torque; Lambda is the
+is the mass matrix with the motors' rotors, so tau is the motors' torque; tau_joint is
+against dry friction and other forces in the joints (joint_friction.py); Lambda is the
 inverse of J inv(M) J'. Stiffness K [N/m] and damping D [N s/m] are not scaled by
 Lambda, which multiplies only the reference's acceleration. The posture q_n follows the
 tip with the tool upright, at the joint velocity v_n.
@@ -26,12 +27,14 @@ from makebreak.systems.arm.numerics.cholesky import (
     forward_solve,
 )
 from makebreak.systems.arm.numerics.energy_tank import N_TANK, fill, paid_stiffness
+from makebreak.systems.arm.numerics.joint_friction import joint_torque
 from makebreak.systems.arm.numerics.joint_limits import (
     braked,
     is_free,
     within_limits,
 )
 from makebreak.systems.arm.numerics.serial_chain import chain_state, tip_kinematics
+from makebreak.systems.numerics.joint_laws import JointLaws
 
 # Status bits.
 REFERENCE_HELD = 1
@@ -40,7 +43,10 @@ FORCE_SENSOR_HELD = 16
 
 IK_DAMPING = 0.02  # Of the posture's damped inverse kinematics [m], [rad].
 IK_STEP_MAX = 0.05  # Largest change of a joint of the posture in one step [rad].
-LIMIT_MARGIN = 0.03  # Distance of the posture from the joint limits [rad].
+# Distance of the posture from the joint limits [rad], [m]; at most LIMIT_PART of a
+# joint's range.
+LIMIT_MARGIN = 0.03
+LIMIT_PART = 0.15
 
 # While an encoder gives NaN (held_motion):
 HOLD_DAMPING = 20.0  # Rate at which the arm is slowed down [1/s].
@@ -53,13 +59,18 @@ HOLD_GAIN = 0.1  # Gain from a measured position to the predicted speed.
 # unstable. The Lambda terms fade there; spring and damper, without Lambda, remain.
 SINGULAR = 0.1
 
-CONTACT_FORCE_MIN = 0.5  # Below this measured force the integral is frozen [N].
+CONTACT_FORCE_MIN = 0.5  # Below this measured force the tip is in the air [N].
+# In the air longer than a rebound takes, and than the force takes to rise, the integral
+# brings the tip back: something unknown holds it up (force_control).
+LOST_SEC = 0.2
+LOST_GAIN = 2.0  # [1/s]
 SAME_DIRECTION = 0.98  # Cosine above which a direction counts as the one before.
 ENGAGE_SEC = 0.02  # Time in which the stiffness along a new direction fades out.
 # A slot for each direction under force control, also while it is released: [n (3),
-# present target, integral, weight 0 to 1, D_n, 1 while active, n'v filtered].
-N_SLOTS, SLOT = 4, 9
-LEVEL, INTEGRAL, WEIGHT, DAMPING, ACTIVE, SPEED = 3, 4, 5, 6, 7, 8
+# present target, integral, weight 0 to 1, D_n, 1 while active, n'v filtered, time in
+# the air].
+N_SLOTS, SLOT = 4, 10
+LEVEL, INTEGRAL, WEIGHT, DAMPING, ACTIVE, SPEED, IN_AIR = 3, 4, 5, 6, 7, 8, 9
 # Filter of n'v [s]. D_n is large and the encoders' velocity is noisy: without it the
 # noise alone would reach the torque's rate limit. The natural frequency of a contact is
 # below 20 Hz.
@@ -98,6 +109,7 @@ class Law(NamedTuple):
     control_orientation: bool  # The task is the full pose, not only the position.
     period: float  # Of a tick [s].
     force: ForceLaw
+    laws: JointLaws  # Forces in the joints, as of joint_friction.to_compensate.
 
 
 def memory_size(n: int) -> int:
@@ -167,7 +179,8 @@ def posture_step(chain, law, q_n, p_tip):
     out = np.empty(n)
     for i in range(n):
         change = min(max(step[i], -IK_STEP_MAX), IK_STEP_MAX)
-        lower, upper = law.q_lower[i] + LIMIT_MARGIN, law.q_upper[i] - LIMIT_MARGIN
+        margin = min(LIMIT_MARGIN, LIMIT_PART * (law.q_upper[i] - law.q_lower[i]))
+        lower, upper = law.q_lower[i] + margin, law.q_upper[i] - margin
         out[i] = min(max(q_n[i] + change, lower), upper)
     return out
 
@@ -211,11 +224,16 @@ def force_control(law, slots, directions, targets, measured):
     """One tick of force control: updates the slots (N_SLOTS, SLOT) in place.
 
     The force along a slot's n is weight (level + integral - D_n n'v), at least 0 at
-    rest (impedance_torque).
+    rest (impedance_torque). On a surface the integral's error is F_c - F. In the air it
+    is F_c - D_n n'v, zero at the speed F_c / D_n at which a tip without disturbance
+    closes a gap: the integral grows only while something holds the tip back, and the
+    tip never comes faster than that for long.
 
     Args: directions (6,): two rows n, zero for none; targets (2,) [N]; measured (6,):
-        wrench on the tool [N], [N m]; all finite.
+        wrench on the tool [N], [N m]; finite, or (0,) where there is none: then the
+        integral waits.
     """
+    sensed = measured.size > 0
     force = law.force
     rows = _orthonormal(directions)
     slots[:, ACTIVE] = 0.0
@@ -243,12 +261,18 @@ def force_control(law, slots, directions, targets, measured):
         step = max(target, slot[LEVEL]) * law.period / force.ramp_sec
         slot[LEVEL] += min(max(target - slot[LEVEL], -step), step)
         slot[DAMPING] = max(target / force.closing_speed, force.normal_damping)
-        felt = -np.sum(n * measured[:3])
+        felt = -np.sum(n * measured[:3]) if sensed else 0.0
+        gain, missing = 0.0, 0.0
         if felt >= CONTACT_FORCE_MIN:
+            gain, missing = force.integral_gain, slot[LEVEL] - felt
+            slot[IN_AIR] = 0.0
+        elif sensed:
+            slot[IN_AIR] += law.period
+            if slot[IN_AIR] > LOST_SEC and force.integral_gain > 0.0:
+                gain, missing = LOST_GAIN, slot[LEVEL] - slot[DAMPING] * slot[SPEED]
+        if gain > 0.0:
             most = force.integral_max
-            grown = slot[INTEGRAL] + (
-                force.integral_gain * (slot[LEVEL] - felt) * law.period
-            )
+            grown = slot[INTEGRAL] + gain * missing * law.period
             slot[INTEGRAL] = min(max(grown, -most), most)
     for j in range(N_SLOTS):
         slot = slots[j]
@@ -323,8 +347,8 @@ def impedance_torque(
     twist = J @ v
     error, rate = np.empty(m), np.empty(m)
     error[:3], rate[:3] = x_d[:3] - s.p_WE, x_d[7:10] - twist[:3]
-    a_ref = np.empty(m)
-    a_ref[:3] = x_d[13:16]
+    a_ref, moves = np.empty(m), np.zeros(6)  # The reference across the forces.
+    a_ref[:3], moves[:3] = x_d[13:16], x_d[7:10]
     scale = 1.0  # Of stiffness and damping about the axes.
     if m == 6:
         # Explicit damping d is stable while d period < inertia. The wrist's inertia may
@@ -334,7 +358,7 @@ def impedance_torque(
         scale = 1.0 if most < 0.5 else 0.5 / most
         error[3:] = rotation_error(R_d, s.R_WE)
         rate[3:] = x_d[10:13] - twist[3:]
-        a_ref[3:] = x_d[16:19]
+        a_ref[3:], moves[3:] = x_d[16:19], x_d[10:13]
     stored = _under_motion_control(slots, scale, error)
     stiffness = paid_stiffness(tank, stiffness, stored, law.tank)
     lost = _under_motion_control(slots, scale, rate)
@@ -355,6 +379,7 @@ def impedance_torque(
             push -= slots[j, DAMPING] * slots[j, SPEED]
             F[:3] += weight * (push - np.sum(n_j * F[:3])) * n_j
             a_ref[:3] -= weight * np.sum(n_j * a_ref[:3]) * n_j
+            moves[:3] -= weight * np.sum(n_j * moves[:3]) * n_j
     F += wrench[:m]
 
     # Posture: its acceleration, minus the part that would move the tip.
@@ -368,7 +393,10 @@ def impedance_torque(
     cholesky_solve(L_task, inertial)
     if n <= m and part < SINGULAR:
         inertial *= (part / SINGULAR) ** 2
-    return J.T @ (F + inertial) + s.bias + s.M @ qdd, s.p_WE
+    tau = J.T @ (F + inertial) + s.bias + s.M @ qdd
+    if np.any(law.laws.p[:, :2] != 0.0):
+        tau += joint_torque(law.laws, q, v, _damped_inverse(s.J, moves))
+    return tau, s.p_WE
 
 
 @numba.njit(cache=True)
@@ -468,7 +496,7 @@ def tick(
     else:
         status |= REFERENCE_HELD
     if not np.all(np.isfinite(measured)):
-        measured = np.zeros(6)  # Below CONTACT_FORCE_MIN: freezes the integral.
+        measured = np.zeros(0)
         status |= FORCE_SENSOR_HELD
     slots = memory[2 * n + 18 : -n - N_TANK].reshape(N_SLOTS, SLOT)
 

@@ -36,7 +36,10 @@ from makebreak.systems.arm.numerics.cholesky import cholesky, cholesky_solve
 EFFORT_LIMITED, RATE_LIMITED, JOINT_BRAKED = 4, 8, 32  # Bits of the status.
 
 SPEED_SHARE = 0.8  # V over the speed limit.
-RANGE_MARGIN = 0.02  # Of the position limits [rad]; errors of encoders are smaller.
+# Of the position limits [rad], [m]; errors of encoders are smaller. At most RANGE_PART
+# of a joint's range.
+RANGE_MARGIN = 0.02
+RANGE_PART = 0.1
 RANGE_RATE = 10.0  # c [1/s]
 GAIN = 100.0  # k [1/s]; with a delay at most DELAY_GAIN over it.
 DELAY_GAIN = 0.5  # k delay; above pi/2 the brake would swing by itself.
@@ -73,8 +76,9 @@ def within_limits(law, tau, asked):
 def speed_bounds(law, q, i):
     """(v_lo, v_hi) of joint i at q (n,) [rad/s]."""
     most = SPEED_SHARE * law.speed_max[i]
-    up = RANGE_RATE * (law.q_upper[i] - RANGE_MARGIN - q[i])
-    down = RANGE_RATE * (law.q_lower[i] + RANGE_MARGIN - q[i])
+    margin = min(RANGE_MARGIN, RANGE_PART * (law.q_upper[i] - law.q_lower[i]))
+    up = RANGE_RATE * (law.q_upper[i] - margin - q[i])
+    down = RANGE_RATE * (law.q_lower[i] + margin - q[i])
     return max(min(down, most), -most), min(max(up, -most), most)
 
 
