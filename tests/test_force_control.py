@@ -75,7 +75,7 @@ class Loop:
         scene = read_scene(TABLETOP_WALLS)
         set_tool(scene, "sphere")
         set_friction(scene, dict.fromkeys(["table", "red_block"], friction))
-        scene.effects = list(world)
+        scene.effects = [*scene.effects, *world]
         builder = DiagramBuilder()
         self.station = builder.AddSystem(
             make_station(
