@@ -93,7 +93,7 @@ def mended(
                 defects.append(f"link {name!r} {fault}")
         if defects:
             raise ValueError(
-                f"model {model.name}: {'; '.join(defects)}. `makebreak inspect FILE "
+                f"model {model.name}: {'; '.join(defects)}. `makebreak inspect ROBOT "
                 "--repair` proposes inertias"
             )
         done.append(ModelText(model.name, document.toxml()))

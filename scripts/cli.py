@@ -230,10 +230,15 @@ def _gap_until(args, interrupt, drake) -> int:
 
 
 def _inspect(args) -> int:
-    from makebreak.scripts.inspect_command import run_inspect
+    from makebreak.scripts.inspect_command import run_inspect, run_repair
 
     robot = Path(args.robot) if args.robot else None
     out = Path(args.out) if args.out else None
+    if args.repair:
+        lines, files = run_repair(Path(args.log), out)
+        print("\n".join(lines))
+        print_files(files)
+        return 0
     table, sidecar, files = run_inspect(Path(args.log), robot, out)
     print(table.to_text())
     if out is None:

@@ -7,6 +7,9 @@ import numpy as np
 from makebreak.gap.data.proposal import Match, sidecar_text
 from makebreak.gap.data.robot import Log, Robot, matches_of, read_log, read_robot
 from makebreak.gap.data.table import stem_of
+from makebreak.models.model_files import without_lost_collisions
+from makebreak.models.model_inertias import repaired
+from makebreak.models.scene_reader import given_packages
 from makebreak.scripts.outputs import OutputFolder
 from makebreak.scripts.table import Table
 
@@ -78,3 +81,24 @@ def run_inspect(
     with OutputFolder(out, "inspect", inputs) as folder:
         folder.file(f"{stem_of(path)}.yaml").write_text(text)
         return table, text, folder.commit()
+
+
+def run_repair(path: Path, out: Path | None) -> tuple[list[str], list[Path]]:
+    """Lines about the inertias of a robot's file that no body has, with proposals, and
+    the repaired copy that is written to `out`.
+
+    Raises: ValueError, one line, for a file that is no URDF, SDF or xacro.
+    """
+    file = without_lost_collisions(path, given_packages())
+    if file.suffix == ".xml":
+        raise ValueError(f"{path}: MuJoCo has accepted its inertias already")
+    is_plain = path.suffix.lower() != ".xacro"
+    text, lines = repaired(path.read_text() if is_plain else file.text)
+    if not lines:
+        return [f"{path}: all inertias are those of bodies"], []
+    if out is None:
+        return [*lines, "--out DIR writes a repaired copy"], []
+    with OutputFolder(out, "inspect", [path]) as folder:
+        name = f"{path.name.split('.')[0]}_repaired{file.suffix}"
+        folder.file(name).write_text(text)
+        return lines, folder.commit()

@@ -50,7 +50,7 @@ FILES = {
         '<geom type="box" size=".1 .02 .03" pos="0 .1 0" euler="10 20 30"/>'
     ),
     "compiler": arm(
-        top='<compiler angle="radian" eulerseq="zyx" settotalmass="7" '
+        top='<compiler angle="radian" eulerseq="zyx" '
         'boundinertia="0.01"/>'
     ),
     "three joints in a body": arm(

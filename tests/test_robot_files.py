@@ -13,6 +13,7 @@ from makebreak.models.effects.model_text import Inertial
 from makebreak.models.model_export import to_mjcf, to_urdf
 from makebreak.models.model_inertias import fault_of, faults_of, repaired
 from makebreak.models.scene import load_scene, read_scene
+from makebreak.scripts.cli import main
 
 LINK = """<link name="{name}"><inertial><origin xyz="0 0 -0.2"/><mass value="{m}"/>
 <inertia ixx="{I[0]}" iyy="{I[1]}" izz="{I[2]}" ixy="0" ixz="0" iyz="0"/></inertial>
@@ -268,6 +269,8 @@ def test_all_impossible_inertias_are_listed_at_once_and_repaired(tmp_path):
         plant_of(tmp_path, path)
     text, changed = repaired(path.read_text())
     assert len(changed) == 2 and not faults_of(text)
+    assert main(["inspect", str(path), "--repair", "--out", str(tmp_path / "o")]) == 0
+    assert (tmp_path / "o/arm_repaired.urdf").read_text() == text
     (tmp_path / "new.urdf").write_text(text)
     assert plant_of(tmp_path, tmp_path / "new.urdf").plant.num_positions() == 2
 

@@ -13,6 +13,7 @@ GUESSED_GAINS = "guessed_gains"  # Kind of the finding about a proposed scene's 
 NO_DRIVE = "no_drive"  # The same where no column says what drives them.
 NO_COLUMN = "no_column"  # Joints of a proposed scene that no column was taken for.
 FIXED = "fixed_joints"  # The same of joints that it takes to stand still.
+MODEL_FILE = "model_file"  # What a robot's file says and nobody uses.
 TOOL_WEIGHT = "tool_weight"  # Of a wrench that holds it (residuals/tool_weight.py).
 SAMPLED_COMMANDS = "sampled_commands"  # Kind of the finding of sampled_commands.py.
 _MOST_EPISODES = 40

@@ -16,6 +16,7 @@ from makebreak.gap.data.csv_table import text_columns
 from makebreak.gap.data.findings import (
     FIXED,
     GUESSED_GAINS,
+    MODEL_FILE,
     NO_COLUMN,
     NO_DRIVE,
     Finding,
@@ -236,7 +237,8 @@ class Proposal:
     tells them. is_driven: whether a column says what drives the joints. without: of
     joints that have no column of a position; unused: columns of quantities of unknown
     joints. fixed: joints that are taken to stand still. first: the first log's name.
-    copies: {name beside the scene: text} of models that are not used as they are."""
+    copies: {name beside the scene: text} of models that are not used as they are.
+    unread: what of the robot's file is not used."""
 
     scene: str
     sidecars: dict[Path, str]
@@ -248,6 +250,7 @@ class Proposal:
     fixed: tuple[str, ...] = ()
     first: str = ""
     copies: Mapping[str, str] = field(default_factory=dict)
+    unread: tuple[str, ...] = ()
 
     def findings(self) -> list[Finding]:
         """What a result must not forget."""
@@ -259,6 +262,9 @@ class Proposal:
                 "they are not known."
             )
             found.append(Finding(GUESSED_GAINS, name, "time", 0, "", "warning", says))
+        for note in self.unread:
+            says = f"The model's file: {note}."
+            found.append(Finding(MODEL_FILE, name, "time", 0, "", "warning", says))
         if self.fixed:
             says = (
                 f"{', '.join(self.fixed)} {_stands(self.fixed)} (fixed_joints of the "
@@ -340,7 +346,10 @@ def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
             f"- add_weld: {{parent: world, child: {robot.model}::{base}}}"
             "  # It stands upright on the world's origin."
         )
-        notes.append(f"{base} is welded to the world, upright")
+        notes.append(
+            f"{base} is welded to the world, upright: a base that moves, or is tilted, "
+            "needs its pose in the log and a scene without this weld"
+        )
     if fixed:
         where = ", ".join(f"{name}: {q:g}" for name, q in fixed.items())
         lines.append(
@@ -374,6 +383,7 @@ def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
         tuple(fixed),
         stem_of(logs[0].path),
         copies,
+        robot.file.notes,
     )
 
 
