@@ -277,7 +277,7 @@ def make_parser(functions: Mapping[str, Callable]) -> argparse.ArgumentParser:
     p.add_argument(
         "--robot",
         metavar="FILE",
-        help="the robot's .urdf, .sdf, .xml or .xacro; columns are matched to its joints",
+        help="the robot's .urdf, .sdf, .xml or .xacro, to match columns to joints",
     )
     p.add_argument(
         "--out", metavar="DIR", help="folder for the proposed sidecar (default: none)"
@@ -285,7 +285,7 @@ def make_parser(functions: Mapping[str, Callable]) -> argparse.ArgumentParser:
     p.add_argument(
         "--repair",
         action="store_true",
-        help="LOG is a robot's file: list the inertias that no body has, propose others",
+        help="LOG is a robot's file: list inertias that no body has, propose others",
     )
 
     p = commands.add_parser(
