@@ -115,6 +115,18 @@ class NamedEffect:
 
 
 @dataclass(frozen=True)
+class Tried:
+    """An effect that was tried and that the data do not confirm, so that it is not in
+    the scene: with its value, and why not, in words."""
+
+    kind: str
+    at: tuple[str, ...]
+    parameters: Mapping[str, Estimate]
+    says: str
+    why: str
+
+
+@dataclass(frozen=True)
 class InUnits:
     """Rms error of a channel, or of a joint's equation, before and after, in its own
     unit. noise: standard deviation of a sample, as used. expected: what a perfect model
@@ -193,8 +205,12 @@ class GapMeasure:
     in_equations: rms of the equations of motion over the noise, before and after, in
         recordings that nothing was decided on; None where none was kept for that.
     n_windows: that were compared, failed: of them those that could not be simulated to
-        their end, before and after. data: "reported" if neither a fit nor a choice saw
-        them, "chosen on" else.
+        their end, before and after; failure: which one that was and why, as a sentence.
+        data: "reported" if neither a fit nor a choice saw them, "chosen on" else.
+    by_window: {channel: (2, 2, n) mean squares over the expected error and over a
+        sample's noise, before and after, of each window}; NaN where one does not count.
+    by_block: {joint: (2, n) mean squares over the noise of its equation of motion,
+        before and after, of each block of time}.
     """
 
     before: float
@@ -209,6 +225,14 @@ class GapMeasure:
     data: str = "reported"
     seconds: float = 0.0  # Of recording that were compared.
     in_equations: tuple[float, float] | None = None
+    failure: str = ""
+    by_window: Mapping[str, np.ndarray] = field(default_factory=dict, repr=False)
+    by_block: Mapping[str, np.ndarray] = field(default_factory=dict, repr=False)
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether anything was compared: a simulation that failed says nothing."""
+        return bool(np.isfinite(self.before) and np.isfinite(self.after))
 
     @property
     def reduction(self) -> float:
@@ -287,6 +311,7 @@ class GapResult:
     nuisance_scene: Sequence[Effect] = ()  # The links as the nuisances have them.
     differs: Sequence[Differs] = ()
     unfinished: Sequence[str] = ()  # What a budget or an interrupt left undone.
+    tried: Sequence[Tried] = ()
 
     def __post_init__(self):
         if self.verdict not in VERDICTS:
@@ -312,6 +337,15 @@ class GapResult:
             "unfinished": list(self.unfinished),
             "where": [dict(vars(each)) for each in self.where],
             "effects": [_effect_json(each) for each in self.effects],
+            "tried": [
+                {
+                    **_place_json(each.kind, each.at),
+                    "parameters": _parameters_json(each.parameters),
+                    "says": each.says,
+                    "why": each.why,
+                }
+                for each in self.tried
+            ],
             "gap": {
                 "before": _number(self.gap.before),
                 "after": _number(self.gap.after),
@@ -325,6 +359,7 @@ class GapResult:
                 "seconds": _number(self.gap.seconds),
                 "windows": self.gap.n_windows,
                 "windows_failed": list(self.gap.failed),
+                "failure": self.gap.failure,
                 "in_units": {k: _plain(v) for k, v in self.gap.in_units.items()},
                 "equations": {k: _plain(v) for k, v in self.gap.equations.items()},
                 "in_equations": _in_equations_json(self.gap),
@@ -362,20 +397,9 @@ def _in_equations_json(gap: GapMeasure) -> dict[str, Any] | None:
 
 
 def _effect_json(each: NamedEffect) -> dict[str, Any]:
-    at: str | list[str] = each.at[0] if len(each.at) == 1 else list(each.at)
     return {
-        "kind": each.kind,
-        "at": at,
-        "parameters": {
-            name: {
-                "value": _number(p.value),
-                "std": _number(p.std) if p.fitted else None,
-                "unit": p.unit,
-                "or_more": p.or_more,
-                "fitted": p.fitted,
-            }
-            for name, p in each.parameters.items()
-        },
+        **_place_json(each.kind, each.at),
+        "parameters": _parameters_json(each.parameters),
         "says": each.says,
         "recordings": list(each.recordings),
         "evidence": {
@@ -398,10 +422,26 @@ def _effect_json(each: NamedEffect) -> dict[str, Any]:
     }
 
 
+def _place_json(kind: str, at: Sequence[str]) -> dict[str, Any]:
+    return {"kind": kind, "at": at[0] if len(at) == 1 else list(at)}
+
+
+def _parameters_json(parameters: Mapping[str, Estimate]) -> dict[str, Any]:
+    return {
+        name: {
+            "value": _number(p.value),
+            "std": _number(p.std) if p.fitted else None,
+            "unit": p.unit,
+            "or_more": p.or_more,
+            "fitted": p.fitted,
+        }
+        for name, p in parameters.items()
+    }
+
+
 def _of(effect: Effect) -> dict[str, Any]:
     return {
-        "kind": effect.kind,
-        "at": effect.at[0] if len(effect.at) == 1 else list(effect.at),
+        **_place_json(effect.kind, effect.at),
         "parameters": {k: _number(v) for k, v in effect.parameters.items()},
     }
 

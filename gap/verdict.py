@@ -1,16 +1,23 @@
 """The verdict on a gap, in numbers and in words."""
 
-from collections.abc import Sequence
-from dataclasses import replace
-from math import isfinite, isnan
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import isfinite
 
 from pydrake.multibody.plant import MultibodyPlant
 
 from makebreak.gap.budget import present
 from makebreak.gap.data.recording import unit_of
 from makebreak.gap.problem import leaves_gap, share_left
-from makebreak.gap.result import Estimate, Evidence, GapMeasure, NamedEffect, plain
-from makebreak.gap.search.choice import Choice, Selection, called
+from makebreak.gap.result import (
+    Estimate,
+    Evidence,
+    GapMeasure,
+    NamedEffect,
+    Tried,
+    plain,
+)
+from makebreak.gap.search.choice import Choice, called
 from makebreak.gap.thresholds import (
     AGREEMENT_RMS_MAX,
     CLOSED_SHARE_MIN,
@@ -53,70 +60,137 @@ def in_plain_units(gap: GapMeasure) -> str:
     )
 
 
-def verdict_of(
-    choices: Sequence[Choice], start: float, end: float, far: bool = False
-) -> str:
-    """Args: start, end: held-out error without and with all effects, the background
-    within its tolerance; far: it had to be moved beyond."""
-    if not choices:
-        calm = start <= max(AGREEMENT_RMS_MAX, NOISE_RMS_MAX) and not far
-        return "no_gap" if calm else "gap_unnamed"
-    if far or leaves_gap(start, end):
-        return "gap_unnamed"
-    return "ambiguous" if any(c.ties or c.sets for c in choices) else "gap_named"
+@dataclass(frozen=True, eq=False)
+class Facts:
+    """What a verdict is decided by.
 
-
-def after_simulation(
-    verdict: str, choices: Sequence[Choice], gap: GapMeasure, far: bool = False
-) -> str:
-    """The verdict by the equations, after simulated windows were asked.
-
-    Args: gap: of windows that were chosen on; far: as of verdict_of.
+    choices: what is named. start, end: held-out error without and with it, the
+    background within its tolerance; far: that had to be moved beyond. chosen_on,
+    reported: what simulation says of data that effects were chosen on, and of data that
+    nothing was decided on; None: not asked. loud: a channel, or equation, and how many
+    times its noise it is off, of which more than `loud_max` is a gap. asks_simulation:
+    whether agreement needs simulated windows. turned: that another direction of gravity
+    explains as much, as a sentence. unjudged: what was measured and not compared, as a
+    sentence. found_before: whether an effect was taken off the recordings beforehand.
     """
-    if not choices:
-        return verdict
-    if gap.after > max(gap.before, UNEXPLAINED_RMS):
-        return "gap_unnamed"  # Simulation does not bear the equations out.
-    if gap.after > UNEXPLAINED_RMS and gap.reduction < CLOSED_SHARE_MIN:
-        return "gap_unnamed"  # Most of what it shows is something else.
-    if (
-        verdict == "gap_unnamed"
-        and gap.before > UNEXPLAINED_RMS
-        and gap.after <= AGREEMENT_RMS_MAX
-    ):
-        # With the effects no gap is left. What the equations leave is how a law was
-        # written down in them (a backlash: where the link is in its gap).
-        return verdict_of(choices, 1.0, 1.0, far)
-    return verdict
+
+    choices: Sequence[Choice]
+    start: float
+    end: float
+    far: bool = False
+    chosen_on: GapMeasure | None = None
+    reported: GapMeasure | None = None
+    loud: tuple[str, float] = ("", 0.0)
+    loud_max: float = UNEXPLAINED_RMS
+    asks_simulation: bool = False
+    turned: str = ""
+    unjudged: str = ""
+    found_before: bool = False
 
 
-def why_not_confirmed(verdict: str, gap: GapMeasure) -> str:
-    """Why an agreement does not stand, in words; empty where it does. gap: of windows
-    that nothing was decided on."""
-    if verdict != "no_gap" or not gap.before > UNEXPLAINED_RMS:
-        return ""
-    return (
+def _before(gap: GapMeasure | None) -> float:
+    """The simulated error without effects; 0 where nothing was simulated."""
+    return gap.before if gap is not None and gap.is_measured else 0.0
+
+
+def _left_in_simulation(f: Facts) -> bool:
+    """Simulation does not bear the equations out, or most of what it shows is something
+    else."""
+    g = f.chosen_on
+    if g is None or not g.is_measured:
+        return False
+    if g.after > max(g.before, UNEXPLAINED_RMS):
+        return True
+    return g.after > UNEXPLAINED_RMS and g.reduction < CLOSED_SHARE_MIN
+
+
+def _closed_in_simulation(f: Facts) -> bool:
+    """With the effects simulated windows show no gap any more. What the equations leave
+    is how a law was written down in them (a backlash: where the link is in its gap)."""
+    g = f.chosen_on
+    return _before(g) > UNEXPLAINED_RMS and g.after <= AGREEMENT_RMS_MAX  # type: ignore[union-attr]
+
+
+def _not_simulated(f: Facts) -> bool:
+    return f.chosen_on is None or not f.chosen_on.is_measured
+
+
+def _said(text: str) -> Callable[[Facts], str]:
+    return lambda f: text
+
+
+# (condition, verdict, sentence): the first that holds decides.
+Row = tuple[Callable[[Facts], bool], str, Callable[[Facts], str]]
+WITHOUT_EFFECTS: Sequence[Row] = (
+    (lambda f: not f.start <= max(AGREEMENT_RMS_MAX, NOISE_RMS_MAX) or f.far,
+     "gap_unnamed", _said("")),
+    # Among many others one that is off would not show.
+    (lambda f: f.loud[1] > max(f.loud_max, UNEXPLAINED_RMS), "gap_unnamed",
+     lambda f: f" {f.loud[0]} is off by {figure(f.loud[1], 2)} times its noise."),
+    (lambda f: f.asks_simulation and _not_simulated(f), "not_judged",
+     _said(" No window could be simulated.")),
+    (lambda f: _before(f.chosen_on) > UNEXPLAINED_RMS, "gap_unnamed",
+     _said(" The equations of motion agree, simulated windows do not.")),
+    (lambda f: _before(f.reported) > UNEXPLAINED_RMS, "gap_unnamed",
+     lambda f: (
         " The data used for the decision show no error beyond noise, but on the data "
-        f"held out for the report the simulation error is {figure(gap.before, 2)} "
-        f"times the expected error{in_plain_units(gap)}."
+        "held out for the report the simulation error is "
+        f"{figure(_before(f.reported), 2)} times the expected "
+        f"error{in_plain_units(f.reported) if f.reported else ''}.")),
+    (lambda f: bool(f.unjudged), "not_judged", lambda f: f.unjudged),
+    (lambda f: f.found_before, "gap_named", _said("")),
+    (lambda f: True, "no_gap", _said("")),
+)  # fmt: skip
+WITH_EFFECTS: Sequence[Row] = (
+    (lambda f: f.far or _left_in_simulation(f), "gap_unnamed", _said("")),
+    (lambda f: leaves_gap(f.start, f.end) and not _closed_in_simulation(f),
+     "gap_unnamed", _said("")),
+    (lambda f: bool(f.turned), "ambiguous", lambda f: f.turned),
+    (lambda f: any(c.ties or c.sets for c in f.choices), "ambiguous", _said("")),
+    (lambda f: True, "gap_named", _said("")),
+)  # fmt: skip
+
+
+def decide(facts: Facts) -> tuple[str, str]:
+    """The verdict, and what is to be said of it beside the figures."""
+    rows = WITH_EFFECTS if facts.choices else WITHOUT_EFFECTS
+    return next((verdict, says(facts)) for holds, verdict, says in rows if holds(facts))
+
+
+def too_weak(facts: Facts, closed: float) -> str:
+    """Why effects that leave a gap are no name for it, in words; "": they are. closed:
+    share of the gap that they close in the equations."""
+    if not facts.choices or decide(facts)[0] != "gap_unnamed":
+        return ""
+    if facts.chosen_on is not None:
+        closed = min(closed, facts.chosen_on.reduction)
+    if closed >= CLOSED_SHARE_MIN:
+        return ""
+    return f"It closes {max(closed, 0.0):.0%} of the gap, too little to be named."
+
+
+def tried(choice: Choice, why: str, plant: MultibodyPlant) -> Tried:
+    """An effect that the data do not confirm, in the report's words."""
+    each = named(choice, plant)
+    return Tried(each.kind, each.at, each.parameters, each.says, why)
+
+
+def says_tried(of: Sequence[Tried]) -> str:
+    """What was tried, with its value and why it is not named, as sentences: those with
+    one reason together."""
+    text = ""
+    for why in dict.fromkeys(each.why for each in of):
+        each = [
+            f"{t.kind} at {', '.join(t.at)} ({_values(t)})" for t in of if t.why == why
+        ]
+        text += f" Tried, not confirmed: {'; '.join(each)}. {why}"
+    return text
+
+
+def _values(of: Tried) -> str:
+    return ", ".join(
+        f"{name} {p.text()} {p.unit}".strip() for name, p in of.parameters.items()
     )
-
-
-def withdraw_if_weak(
-    selection: Selection, verdict: str, closed: float
-) -> tuple[Selection, str]:
-    """The selection, without effects where they are no name for the gap, and then what
-    they are worth, in words. closed: share of the gap that they close, simulated and in
-    the equations."""
-    if verdict != "gap_unnamed" or not selection.choices or closed >= CLOSED_SHARE_MIN:
-        return selection, ""
-    names = [called(c.effect) for c in selection.choices]
-    near = f" The best candidates ({'; '.join(names)}) "
-    if isnan(closed):  # No window could be simulated to its end.
-        near += "could not be judged by simulation, so none is named."
-    else:
-        near += f"close {max(closed, 0.0):.0%} of the gap, too little to be named."
-    return replace(selection, choices=(), end=selection.start), near
 
 
 def shows_in_equations_alone(gap: GapMeasure) -> bool:

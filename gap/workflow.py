@@ -23,6 +23,7 @@ from makebreak.gap.by_recording import (
     may_differ,
     with_differences,
 )
+from makebreak.gap.confirm import Veto, confirmed
 from makebreak.gap.data import sampled_commands
 from makebreak.gap.data.channel_noise import in_newton_metres
 from makebreak.gap.data.check_drives import (
@@ -47,6 +48,7 @@ from makebreak.gap.problem import (
     Fitted,
     GapProblem,
     Outcome,
+    is_sane,
     share_left,
 )
 from makebreak.gap.report.clock import zero_of
@@ -69,13 +71,20 @@ from makebreak.gap.residuals.pressing import PressingProblem, presses, push_each
 from makebreak.gap.residuals.sap_lift import sap_lift
 from makebreak.gap.residuals.tool_weight import as_used, check_tool_weight
 from makebreak.gap.residuals.where import begins, spans_of
-from makebreak.gap.result import AGREES, GapMeasure, GapResult, JudgedChannel, Where
+from makebreak.gap.result import (
+    AGREES,
+    GapMeasure,
+    GapResult,
+    JudgedChannel,
+    Tried,
+    Where,
+)
 from makebreak.gap.search.choice import Choice, Selection
 from makebreak.gap.search.chosen_by_simulation import (
     kept_by_simulation,
     preferred_by_simulation,
 )
-from makebreak.gap.search.select import select
+from makebreak.gap.search.select import select, without
 from makebreak.gap.search.softer_by_simulation import softer_by_simulation
 from makebreak.gap.search.trust import drift_sentences, scatter, trust_in
 from makebreak.gap.simulation.measure import WINDOW_SEC
@@ -83,21 +92,22 @@ from makebreak.gap.simulation.windows import WindowModel, with_step
 from makebreak.gap.thresholds import (
     AGREEMENT_RMS_MAX,
     CLOSED_SHARE_MIN,
-    UNEXPLAINED_RMS,
 )
 from makebreak.gap.verdict import (
-    after_simulation,
+    Facts,
+    decide,
     figure,
     named,
     says,
+    says_tried,
     shows_in_equations_alone,
+    too_weak,
+    tried,
     two_figures,
-    verdict_of,
-    why_not_confirmed,
-    withdraw_if_weak,
 )
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import (
+    Effect,
     full_name,
     one_dof_joints,
     sliding_joints,
@@ -393,17 +403,11 @@ def conclude(
 ) -> GapResult:
     """The verdict and what it rests on.
 
-    All is decided on the rows that were fitted and chosen on; then, once, the decided
-    effects are compared with recordings that neither saw. These may take a verdict
-    back; they change no effect and no parameter.
+    All is chosen on the rows that were fitted and chosen on. Then the effects are
+    compared with recordings that neither saw: these may veto effects (gap/confirm.py)
+    and take a verdict back; they choose none.
     """
-    nuisances = selection.nuisances
-    agrees = problem.error(selection.start) <= AGREEMENT_RMS_MAX
-    if agrees and (
-        _follows_noise(problem, selection)
-        or all(problem.is_within_law(c.effect) for c in selection.choices)
-    ):
-        selection = replace(selection, choices=(), end=selection.start)
+    selection = _beyond_laws(problem, selection)
     selection, chosen_on = kept_by_simulation(problem, selection, jobs)
     selection, chosen_on = preferred_by_simulation(problem, selection, chosen_on, jobs)
     selection, chosen_on = softer_by_simulation(problem, selection, chosen_on, jobs)
@@ -413,82 +417,57 @@ def conclude(
         for c in selection.choices
     ]
     selection = replace(selection, choices=tuple(choices))
-    turned, is_better = problem.other_gravity(selection.end) if choices else ("", False)
-    if is_better:  # Forces and loads stand for a robot that hangs on a wall.
-        choices = []
-        selection = replace(selection, choices=(), end=selection.start)
+
+    def facts_of(some: Selection, outcome: Outcome | None) -> Facts:
+        return Facts(
+            some.choices, problem.error(some.start), problem.error(some.end), some.far,
+            outcome.gap if outcome else None, loud=problem.loudest(some.start),
+            loud_max=problem.plan.loud, asks_simulation=problem.plan.simulation_agrees,
+        )  # fmt: skip
+
+    vetoed: list[Veto] = []
+    outcome: Outcome | None = None
+    while True:
+        facts = facts_of(selection, chosen_on)
+        if selection.choices and (why := _withdrawn(problem, selection, facts)):
+            vetoed += [(choice, why) for choice in selection.choices]
+            selection = without(problem, selection, *selection.effects())
+        else:
+            found = confirmed(problem, selection, reported, jobs)
+            outcome, vetoed = found.outcome, [*vetoed, *found.vetoed]
+            if outcome is None and found.selection.choices:
+                vetoed += [(c, _TOO_SHORT_TO_REPORT) for c in selection.choices]
+                selection = without(problem, selection, *selection.effects())
+            elif not found.vetoed:
+                selection = found.selection
+                break
+            else:
+                selection = found.selection
         if chosen_on is not None:
             chosen_on = problem.outcome(
-                [], selection.start, selection.end, nuisances, jobs=jobs
-            )
-    drifting = drift_sentences(problem, selection.end) if choices else ""
-    start, end = problem.error(selection.start), problem.error(selection.end)
-    verdict = verdict_of(choices, start, end, selection.far)
-    near, differs = "", ""
-    if verdict == "no_gap":
-        if chosen_on is None:
-            if problem.plan.simulation_agrees:
-                verdict, differs = "not_judged", " No window could be simulated."
-        elif chosen_on.gap.before > UNEXPLAINED_RMS:
-            verdict = "gap_unnamed"
-            differs = " The equations of motion agree, simulated windows do not."
-    name, size = problem.loudest(selection.start)
-    if verdict == "no_gap" and size > max(problem.plan.loud, UNEXPLAINED_RMS):
-        # Among many others one that is off would not show.
-        verdict = "gap_unnamed"
-        differs = f" {name} is off by {figure(size, 2)} times its noise."
-    if chosen_on is not None:
-        verdict = after_simulation(verdict, choices, chosen_on.gap, selection.far)
-        every = selection
-        equations = problem.closed(selection.start, selection.end)
-        closed = min(chosen_on.gap.reduction, equations)
-        selection, near = withdraw_if_weak(every, verdict, closed)
-        if selection is not every:
-            chosen_on = problem.outcome(
-                [], selection.start, selection.end, nuisances, jobs=jobs
-            )
-    elif choices:
-        selection = replace(selection, choices=(), end=selection.start)
-        verdict = "gap_unnamed"
-        near = (
-            " The recordings are too short to hold out data for the choice of effects."
-        )
-    outcome = problem.outcome(
-        selection.effects(), selection.start, selection.end, nuisances, reported, jobs
-    ) if reported else None  # fmt: skip
-    if outcome is None and selection.choices:
-        selection = replace(selection, choices=(), end=selection.start)
-        verdict = "gap_unnamed"
-        near = (
-            " The recordings are too short to hold out a part for the report; without "
-            "it nothing is named."
-        )
-    if outcome is not None:
-        final, data = outcome, "reported"
-    elif chosen_on is not None:
-        final, data = chosen_on, "chosen on"
-    else:
-        final, data = Outcome(_nothing(start, end)), "fitted"
-    final = replace(final, gap=replace(final.gap, data=data))
-    if why := why_not_confirmed(verdict, final.gap):
-        verdict, differs = "gap_unnamed", why
-    if verdict in ("gap_named", "ambiguous") and not _is_confirmed(final.gap):
-        verdict = "gap_unnamed"
-        near += _not_confirmed(final.gap)
-    near += differs
+                selection.effects(), selection.start, selection.end,
+                selection.nuisances, jobs=jobs,
+            )  # fmt: skip
+    final = _reported_on(problem, selection, outcome, chosen_on)
+    channels = judged_channels(problem)
+    turned = problem.other_gravity(selection.end)[0] if selection.choices else ""
+    facts = replace(
+        facts_of(selection, chosen_on), reported=outcome.gap if outcome else None,
+        turned=turned, unjudged=unjudged_channels(channels),
+        found_before=bool(problem.found_before()),
+    )  # fmt: skip
+    verdict, near = decide(facts)
+    plant = problem.dynamics.plant
+    not_confirmed = [tried(choice, why, plant) for choice, why in vetoed]
+    near = says_tried(not_confirmed) + near
+    if verdict == "gap_unnamed" and not facts.choices and not not_confirmed:
+        not_confirmed = _best_of_all(problem, selection)
     if selection.beyond:
         near += _beyond_limits(selection)
-    channels = judged_channels(problem)
-    if verdict == "no_gap" and (unjudged := unjudged_channels(channels)):
-        verdict = "not_judged"
-        near += unjudged
-    left = problem.error(selection.end)
+    near += _says_failure(final.gap)
     if verdict != "gap_unnamed" or not shows_in_equations_alone(final.gap):
-        near += two_figures(start, left, final.gap, problem.by_equations)
-    if turned and verdict in ("gap_named", "ambiguous"):
-        verdict = "ambiguous"
-        near += turned
-    near += drifting if selection.choices else ""
+        near += two_figures(facts.start, facts.end, final.gap, problem.by_equations)
+    near += drift_sentences(problem, selection.end) if selection.choices else ""
     # Nothing was learned from it: the part that is reported on is looked at last.
     where = [] if verdict in AGREES else [
         *problem.where(selection.start.left),
@@ -496,7 +475,6 @@ def conclude(
     ]  # fmt: skip
     if verdict == "gap_unnamed":
         near += _since(where, final, problem.recordings, reported)
-    if verdict == "gap_unnamed":
         near += problem.hint(selection.end)
     else:
         near += final.expects
@@ -504,17 +482,16 @@ def conclude(
         Choice(f.effect, f.std, f.before, f.after, "", 0.0, (), (), 1)
         for f in problem.found_before()
     ]
-    if before and verdict == "no_gap":
-        verdict = "gap_named"
     effects = [
-        named(c, problem.dynamics.plant, problem.clock_of(c.effect))
+        named(c, plant, problem.clock_of(c.effect))
         for c in (*before, *selection.choices)
     ]
     fixed = [c.fixed for c in selection.choices]
+    nuisances = selection.nuisances
     prior = nuisances.prior
     return GapResult(
         verdict,
-        says(verdict, effects, final.gap, near, left, problem.by_equations),
+        says(verdict, effects, final.gap, near, facts.end, problem.by_equations),
         where, effects,
         final.gap, final.unexplained if verdict == "gap_unnamed" else [],
         {n: float(b / p) for n, b, p in
@@ -526,7 +503,93 @@ def conclude(
         ) if selection.choices else (),
         channels=channels,
         nuisance_scene=problem.nuisance_effects(nuisances, selection.end.b),
+        tried=not_confirmed,
     )  # fmt: skip
+
+
+_TOO_SHORT_TO_REPORT = (
+    "The recordings are too short to hold out a part for the report; without it "
+    "nothing is named."
+)
+_TOO_SHORT_TO_CHOOSE = (
+    "The recordings are too short to hold out data for the choice of effects."
+)
+
+
+def _beyond_laws(problem: GapProblem, selection: Selection) -> Selection:
+    """The selection; without its effects where the scene agrees without them and they
+    only follow noise, or are smaller than what laws are good for."""
+    agrees = problem.error(selection.start) <= AGREEMENT_RMS_MAX
+    if agrees and (
+        _follows_noise(problem, selection)
+        or all(problem.is_within_law(c.effect) for c in selection.choices)
+    ):
+        return replace(selection, choices=(), end=selection.start)
+    return selection
+
+
+def _withdrawn(problem: GapProblem, selection: Selection, facts: Facts) -> str:
+    """Why none of the effects is named, by the data that they were chosen on; "": they
+    are."""
+    turned, is_better = problem.other_gravity(selection.end)
+    if is_better:  # Forces and loads stand for a robot that hangs on a wall.
+        return "Another direction of gravity explains more."
+    if facts.chosen_on is None:
+        return _TOO_SHORT_TO_CHOOSE
+    if not facts.chosen_on.is_measured:
+        return f"It could not be judged by simulation. {facts.chosen_on.failure}"
+    return too_weak(facts, problem.closed(selection.start, selection.end))
+
+
+def _reported_on(
+    problem: GapProblem,
+    selection: Selection,
+    outcome: Outcome | None,
+    chosen_on: Outcome | None,
+) -> Outcome:
+    """What the figures are of: data held out for the report, else data that effects
+    were chosen on, else the rows of the search."""
+    for some, data in ((outcome, "reported"), (chosen_on, "chosen on")):
+        if some is not None and some.gap.is_measured:
+            return replace(some, gap=replace(some.gap, data=data))
+    start, end = problem.error(selection.start), problem.error(selection.end)
+    gap = replace(_nothing(start, end), data="fitted")
+    for some in filter(None, (outcome, chosen_on)):
+        gap = replace(
+            gap, n_windows=some.gap.n_windows, failed=some.gap.failed,
+            failure=some.gap.failure,
+        )  # fmt: skip
+        break
+    return Outcome(gap)
+
+
+def _best_of_all(problem: GapProblem, selection: Selection) -> list[Tried]:
+    """The best candidate where none was good enough to be chosen."""
+    for each in selection.table[:1]:
+        effect = Effect(each.kind, list(each.at), dict(each.parameters))
+        if not each.score < 1.0 or not is_sane(effect):
+            break
+        choice = Choice(effect, {}, 1.0, each.score, "", 0.0, (), (), 1)
+        why = (
+            "The best candidate alone, to first order: it takes "
+            f"{1.0 - each.score:.0%} off the error, too little to be named."
+        )
+        return [tried(choice, why, problem.dynamics.plant)]
+    return []
+
+
+def _says_failure(gap: GapMeasure) -> str:
+    """Which windows could not be simulated and why, as sentences."""
+    if not gap.failure:
+        return ""
+    count = max(gap.failed)
+    if gap.window_s > 0.0:
+        text = f"{count} of {gap.n_windows} windows could not be simulated to their end"
+        return f" {text} and do not count. {gap.failure}"
+    return (
+        " No window could be simulated to its end, so the errors are those of the data "
+        f"before simulation. {gap.failure}"
+    )
 
 
 def _since(
@@ -568,34 +631,6 @@ def _follows_noise(problem: GapProblem, selection: Selection) -> bool:
         loud > AGREEMENT_RMS_MAX
         and share_left(loud, left) > 1.0 - CLOSED_SHARE_MIN
         and problem.error(end) >= problem.error(start)
-    )
-
-
-def _is_confirmed(gap: GapMeasure) -> bool:
-    """Whether simulated windows do better with what is named; where they show no gap
-    without it, whether they show none with it, and the equations of motion say the same
-    of what shows in them."""
-    if gap.before > AGREEMENT_RMS_MAX:
-        return gap.reduction >= CLOSED_SHARE_MIN
-    return gap.after <= AGREEMENT_RMS_MAX and _equations_confirm(gap)
-
-
-def _equations_confirm(gap: GapMeasure) -> bool:
-    if gap.in_equations is None:
-        return True
-    if max(gap.in_equations) <= AGREEMENT_RMS_MAX:
-        return True
-    return gap.reduction_in_equations >= CLOSED_SHARE_MIN
-
-
-def _not_confirmed(gap: GapMeasure) -> str:
-    """In words, that data held out for the report do not bear out what is named."""
-    by, (before, after) = "simulated error", (gap.before, gap.after)
-    if max(before, after) <= AGREEMENT_RMS_MAX and gap.in_equations is not None:
-        by, (before, after) = "error in the equations of motion", gap.in_equations
-    return (
-        f" On the data held out for the report the effects take the {by} from "
-        f"{figure(before)} to {figure(after)}: these data do not confirm them."
     )
 
 

@@ -23,11 +23,12 @@ from makebreak.gap.residuals.objects import FlightProblem, smooth_surface_of
 from makebreak.gap.residuals.pressing import PressingProblem
 from makebreak.gap.residuals.touching import BESIDE, MEETS
 from makebreak.gap.result import GapMeasure
+from makebreak.gap.search.choice import Choice
 from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.search.screen import rank
 from makebreak.gap.simulation.contact_shapes import ContactShapes
 from makebreak.gap.simulation.free_windows import settled
-from makebreak.gap.verdict import after_simulation
+from makebreak.gap.verdict import Facts, decide
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import load_scene, read_scene
 from makebreak.scripts.cli import main
@@ -312,10 +313,15 @@ def measure(before, after):
 
 
 def test_what_leaves_most_of_the_simulated_gap_is_no_name_for_it():
-    some = [object()]
-    assert after_simulation("gap_named", some, measure(29.0, 28.9)) == "gap_unnamed"
-    assert after_simulation("gap_named", some, measure(29.0, 1.2)) == "gap_named"
-    assert after_simulation("gap_named", some, measure(1.1, 1.1)) == "gap_named"
+    nothing: dict = {}
+    some = [Choice(Effect(), nothing, 9.0, 1.0, "", 1.0, (), (), 1)]
+
+    def verdict(before, after):
+        return decide(Facts(some, 29.0, 1.0, chosen_on=measure(before, after)))[0]
+
+    assert verdict(29.0, 28.9) == "gap_unnamed"
+    assert verdict(29.0, 1.2) == "gap_named"
+    assert verdict(1.1, 1.1) == "gap_named"
 
 
 # ----- Many boxes

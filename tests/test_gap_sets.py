@@ -15,7 +15,7 @@ from makebreak.gap.search.chosen_by_simulation import preferred_by_simulation
 from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.search.rivals import still_tied, with_rivals_of_pairs
 from makebreak.gap.search.select import select
-from makebreak.gap.verdict import named, says, verdict_of
+from makebreak.gap.verdict import Facts, decide, named, says
 from makebreak.models.effects.kind import Effect
 
 GAIN, MASS = ("actuator_bias", "arm.joint1"), ("link_mass", "arm.hand")
@@ -40,7 +40,7 @@ def test_two_for_which_two_others_could_stand_are_a_tie():
     here = {(c.effect.kind, c.effect.at[0]) for c in selection.choices}
     there = {(e.kind, e.at[0]) for e in rival.instead}
     assert here | there == {GAIN, MASS, ONE, OTHER}
-    assert verdict_of(selection.choices, 40.0, 1.0) == "ambiguous"
+    assert decide(Facts(selection.choices, 40.0, 1.0))[0] == "ambiguous"
 
 
 @pytest.mark.parametrize("by_evidence", [True, False])
@@ -50,7 +50,7 @@ def test_two_others_that_leave_more_are_no_tie(monkeypatch, by_evidence):
     selection = select(problem(3.7))
     assert {c.effect.kind for c in selection.choices} == {GAIN[0], MASS[0]}
     assert not any(c.sets for c in selection.choices)
-    assert verdict_of(selection.choices, 40.0, 1.0) == "gap_named"
+    assert decide(Facts(selection.choices, 40.0, 1.0))[0] == "gap_named"
 
 
 def chosen(kind: str, at: str, **parameters) -> Choice:

@@ -40,7 +40,7 @@ from makebreak.gap.problem import (
 from makebreak.gap.residuals.late_poses import wanted
 from makebreak.gap.residuals.mechanism import MechanismProblem
 from makebreak.gap.residuals.whitened_rows import WhitenedRows
-from makebreak.gap.result import GapMeasure
+from makebreak.gap.result import Estimate, GapMeasure, Tried
 from makebreak.gap.search import comparison, drop
 from makebreak.gap.search.choice import (
     Choice,
@@ -58,10 +58,10 @@ from makebreak.gap.search.trials import pick_simplest, shortlist
 from makebreak.gap.search.trust import consistency, gauss_newton, ridges, scatter
 from makebreak.gap.thresholds import SAME_ERROR
 from makebreak.gap.verdict import (
-    after_simulation,
-    verdict_of,
-    why_not_confirmed,
-    withdraw_if_weak,
+    Facts,
+    decide,
+    says_tried,
+    too_weak,
 )
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
@@ -1194,41 +1194,45 @@ def windows_leave(before: float, after: float) -> GapMeasure:
     return GapMeasure(before, after, 1.0, 0.3)
 
 
+def a_backlash() -> Choice:
+    return Choice(Effect("joint_backlash", ["a.j"], {"gap": 0.02}), {"gap": 1e-3},
+                  9.0, 3.0, "", 1.0, (), (), 1)  # fmt: skip
+
+
 @pytest.mark.parametrize(
-    "verdict, before, said",
+    "choices, before, verdict, said",
     [
-        ("no_gap", 2.1, "2.1 times"),
-        ("no_gap", 3695.0, "3700 times"),
-        ("no_gap", 1.9, ""),
-        ("gap_named", 9.0, ""),
+        (0, 2.1, "gap_unnamed", "2.1 times"),
+        (0, 3695.0, "gap_unnamed", "3700 times"),
+        (0, 1.9, "no_gap", ""),
+        (1, 9.0, "gap_named", ""),
     ],  # fmt: skip
 )
 def test_an_agreement_that_simulation_does_not_show_at_the_end_is_taken_back(
-    verdict, before, said
+    choices, before, verdict, said
 ):
-    words = why_not_confirmed(verdict, windows_leave(before, before))
-    assert (said in words) and bool(words) == bool(said)
+    some = [a_backlash()] * choices
+    reported = windows_leave(before, before)
+    found, words = decide(Facts(some, 1.0, 1.0, reported=reported))
+    assert found == verdict and (said in words) and bool(words) == bool(said)
 
 
-@pytest.mark.parametrize(
-    "closed, expected",
-    [(0.12, "close 12% of the gap"), (float("nan"), "not be judged")],
-)
-def test_candidates_that_close_too_little_are_told_and_not_named(closed, expected):
-    choice = Choice(Effect("joint_backlash", ["a.j"], {"gap": 0.02}), {"gap": 1e-3},
-                    9.0, 3.0, "", 1.0, (), (), 1)  # fmt: skip
-    every = Selection((choice,), None, None, None)
-    left, words = withdraw_if_weak(every, "gap_unnamed", closed)
-    assert left.choices == () and "joint_backlash at a.j" in words
-    assert expected in words and "nan" not in words
-    assert withdraw_if_weak(every, "gap_unnamed", 0.9) == (every, "")
+@pytest.mark.parametrize("after, closed", [(8.04, "12%"), (5.2, "47%")])
+def test_candidates_that_close_too_little_are_told_with_their_value(after, closed):
+    facts = Facts([a_backlash()], 9.0, after, chosen_on=windows_leave(9.0, after))
+    why = too_weak(facts, 1.0 - (after - 1.0) / 8.0)
+    assert f"closes {closed} of the gap" in why
+    near = Facts([a_backlash()], 9.0, 2.5, chosen_on=windows_leave(9.0, 2.5))
+    assert too_weak(near, 0.9) == ""
+    each = Tried("joint_backlash", ("a.j",), {"gap": Estimate(0.02, 1e-3, "rad")},
+                 "", why)  # fmt: skip
+    text = says_tried([each])
+    assert "joint_backlash at a.j (gap 0.0200 +- 0.0010 rad)" in text and why in text
 
 
 def test_where_simulation_shows_no_gap_any_more_equations_find_none():
-    choice = Choice(Effect("joint_backlash", ["a.j"], {"gap": 0.02}), {"gap": 1e-3},
-                    9.0, 3.0, "", 1.0, (), (), 1)  # fmt: skip
-    verdict = verdict_of([choice], 13.5, 3.4)
-    assert verdict == "gap_unnamed"  # A quarter of it is left in the equations.
+    choices = [a_backlash()]
+    assert decide(Facts(choices, 13.5, 3.4))[0] == "gap_unnamed"  # A quarter is left.
     for before, after, far, expected in (
         (4.3, 1.1, False, "gap_named"),
         (4.3, 1.1, True, "gap_unnamed"),  # The model would have to be off too far.
@@ -1236,10 +1240,11 @@ def test_where_simulation_shows_no_gap_any_more_equations_find_none():
         (1.2, 1.1, False, "gap_unnamed"),  # Windows that do not show the gap.
     ):
         gap = windows_leave(before, after)
-        assert after_simulation(verdict, [choice], gap, far) == expected
-    assert after_simulation("gap_unnamed", [], windows_leave(4.3, 1.1)) == "gap_unnamed"
+        assert decide(Facts(choices, 13.5, 3.4, far, gap))[0] == expected
     worse = windows_leave(2.5, 2.6)
-    assert after_simulation("gap_named", [choice], worse) == "gap_unnamed"
+    assert decide(Facts(choices, 9.0, 1.0, chosen_on=worse))[0] == "gap_unnamed"
+    none = Facts((), 13.5, 13.5, chosen_on=windows_leave(4.3, 1.1))
+    assert decide(none)[0] == "gap_unnamed"
 
 
 class TwoJoints(MechanismProblem):

@@ -9,7 +9,7 @@ from gap_benchmark import push_world
 from gap_benchmark.push_world import BLOCK, TABLE
 from push_problems import screen_of
 
-from makebreak.gap import workflow
+from makebreak.gap import confirm
 from makebreak.gap.data.pieces import part_of
 from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.data.recording import Episode
@@ -121,16 +121,14 @@ def test_recordings_that_are_too_short_tell_nothing(pushes):
 )
 def test_equations_confirm_what_windows_do_not_show(windows, equations, good):
     gap = GapMeasure(*windows, 1.0, 0.6, in_equations=equations)
-    assert workflow._is_confirmed(gap) == good
+    assert confirm.is_confirmed(gap) == good
 
 
 def test_what_is_not_confirmed_is_said_with_the_figures_that_say_so():
     gap = GapMeasure(0.9, 0.8, 1.0, 0.6, in_equations=(9.0, 6.0))
-    assert "error in the equations of motion from 9 to 6" in workflow._not_confirmed(
-        gap
-    )
+    assert "error in the equations of motion from 9 to 6" in confirm.not_confirmed(gap)
     gap = GapMeasure(8.0, 7.0, 1.0, 0.6, in_equations=(9.0, 6.0))
-    assert "simulated error from 8 to 7" in workflow._not_confirmed(gap)
+    assert "simulated error from 8 to 7" in confirm.not_confirmed(gap)
 
 
 def test_the_sentence_has_the_figures_of_what_was_held_out():

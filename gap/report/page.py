@@ -39,6 +39,7 @@ def report_html(
         sections.series(result, pictures),
         sections.in_units(result),
         sections.trust(result, pictures),
+        sections.tried(result),
         sections.considered(result),
         sections.unexplained(result),
         sections.checks(result),

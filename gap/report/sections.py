@@ -71,6 +71,22 @@ def series(result: GapResult, pictures: Mapping[str, bytes]) -> str:
     return section("Measured, before, after", picture + note)
 
 
+def tried(result: GapResult) -> str:
+    """What was tried and is not in the scene, with its value and why."""
+    if not result.tried:
+        return ""
+    rows = [
+        [
+            t.kind, ", ".join(t.at),
+            ", ".join(f"{n} {p.text()} {p.unit}" for n, p in t.parameters.items()),
+            t.why,
+        ]
+        for t in result.tried
+    ]  # fmt: skip
+    heads = ["kind", "at", "value", "why it is not in the scene"]
+    return section("Tried, not confirmed", table(heads, rows, most=8))
+
+
 def considered(result: GapResult) -> str:
     """The candidates, and what each would have left."""
     if not result.candidates:

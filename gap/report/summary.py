@@ -42,6 +42,9 @@ def summary_lines(result: GapResult) -> list[str]:
         lines += [f"    or: {says}" for says in sets_of(each)]
         if each.tell_apart:
             lines.append(f"    to distinguish them: {each.tell_apart}")
+    for none in result.tried:
+        if none.why not in result.says:
+            lines.append(f"  Tried, not confirmed: {none.says} {none.why}")
     return lines
 
 

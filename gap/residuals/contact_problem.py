@@ -48,7 +48,12 @@ from makebreak.gap.simulation.contact_windows import (
     varies,
 )
 from makebreak.gap.simulation.face_supports import LiesOn
-from makebreak.gap.simulation.measure import gap_measure, series_of, unseen_series
+from makebreak.gap.simulation.measure import (
+    gap_measure,
+    series_of,
+    unseen_series,
+    why_stopped,
+)
 from makebreak.gap.thresholds import AGREEMENT_RMS_MAX
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, sliding_joints
@@ -651,9 +656,17 @@ class ContactProblem(ContactCandidates, GapProblem):
             model = model.with_spread_of(effects)
         before = model.simulate(())
         after = model.simulate(effects) if effects else before
-        gap = gap_measure(model, before, after, held)
+
+        def why(k: int, with_effects: bool) -> str:
+            return why_stopped(model, effects if with_effects else (), k)
+
+        gap = gap_measure(model, before, after, held, why)
         if recordings is not None and (found := self.unseen(recordings, start, end)):
             gap = replace(gap, in_equations=found[0], equations=found[1])
+            if not gap.is_measured:
+                gap = replace(gap, before=found[0][0], after=found[0][1])
+        if not gap.is_measured or not gap.window_s:
+            return Outcome(gap)
         return Outcome(
             gap,
             [

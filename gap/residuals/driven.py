@@ -40,7 +40,7 @@ from makebreak.gap.residuals.objects import unexplained_in_windows
 from makebreak.gap.residuals.where import where_in_windows
 from makebreak.gap.result import Where
 from makebreak.gap.simulation.driven_arm import DrivenArmSimulation, can_have
-from makebreak.gap.simulation.measure import gap_measure, series_of
+from makebreak.gap.simulation.measure import gap_measure, series_of, why_stopped
 from makebreak.gap.simulation.windows import LARGEST, WindowModel
 from makebreak.models.drives import DRIVEN_BY, law_of
 from makebreak.models.effects import KINDS
@@ -450,8 +450,15 @@ class DrivenProblem(DrivenWindows, GapProblem):
             except ValueError:
                 continue
             break
+
+        def why(k: int, with_effects: bool) -> str:
+            return why_stopped(model, [*moved, *effects] if with_effects else moved, k)
+
+        gap = gap_measure(model, before, after, held, why)
+        if not gap.is_measured:
+            return Outcome(gap)
         return Outcome(
-            gap_measure(model, before, after, held),
+            gap,
             series_of(model, before, after, held),
             unexplained_in_windows(model, after),
             where=where_in_windows(model, model.errors(before)) if recordings else (),

@@ -11,7 +11,12 @@ from makebreak.gap.problem import rms
 from makebreak.gap.residuals.inverse import InverseModel
 from makebreak.gap.residuals.where import where_in_windows
 from makebreak.gap.result import GapMeasure, InUnits, Series, Where
-from makebreak.gap.simulation.measure import WINDOW_SEC, gap_measure, series_of
+from makebreak.gap.simulation.measure import (
+    WINDOW_SEC,
+    gap_measure,
+    series_of,
+    why_stopped,
+)
 from makebreak.gap.simulation.windows import Window, WindowModel, seen_in
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, sliding_joints
@@ -59,13 +64,25 @@ def measure(
         for each, y in zip(trials, found, strict=True)
     ]
     before, after = found[0], found[-1]
-    gap = gap_measure(model, before, after, held)
-    gap = replace(
-        gap,
-        equations=_equations(motion, trials[0], trials[-1], every),
-    )
-    where = where_in_windows(model, model.errors(before)) if every else []
-    return gap, series_of(model, before, after, held), where
+
+    def why(k: int, with_effects: bool) -> str:
+        return why_stopped(model, trials[-1 if with_effects else 0], k)
+
+    gap = gap_measure(model, before, after, held, why)
+    equations, by_block = _equations(motion, trials[0], trials[-1], every)
+    gap = replace(gap, equations=equations, by_block=by_block)
+    if gap.is_measured:
+        where = where_in_windows(model, model.errors(before)) if every else []
+        return gap, series_of(model, before, after, held), where
+    if by_block:  # No window could be simulated.
+        each = np.mean([of.mean(axis=1) for of in by_block.values()], axis=0)
+        start, end = map(float, np.sqrt(each))
+        seconds = float(sum(
+            np.ptp(motion.recordings[w.recording].time[w.rows])
+            for w, h in zip(model.windows, held, strict=True) if h
+        ))  # fmt: skip
+        gap = replace(gap, before=start, after=end, seconds=seconds)
+    return gap, [], []
 
 
 def _simulated(model: WindowModel, effects: Sequence[Effect], held, lag):
@@ -81,24 +98,36 @@ def _simulated(model: WindowModel, effects: Sequence[Effect], held, lag):
         return [np.full((n, len(model.channels)), np.inf) for n in lengths]
 
 
-def _equations(motion: InverseModel, before, after, every: bool) -> dict[str, InUnits]:
-    """What the model leaves of each joint's effort, in its unit."""
+def _equations(
+    motion: InverseModel, before, after, every: bool
+) -> tuple[dict[str, InUnits], dict[str, np.ndarray]]:
+    """What the model leaves of each joint's effort, in its unit; and its mean squares
+    over the noise by block of time (GapMeasure.by_block)."""
+    n = len(motion.names())
     rows = np.ones(len(motion.train()), bool) if every else ~motion.train()
-    rows = rows.reshape(-1, len(motion.names()))[:, 0]
+    rows = rows.reshape(-1, n)[:, 0]
     try:
-        left = [motion.in_units(motion.residual(each)) for each in (before, after)]
+        both = [motion.residual(each) for each in (before, after)]
     except ValueError:
-        return {}
+        return {}, {}
+    left = [motion.in_units(r) for r in both]
     noise = motion.noise_in_units()
     slides = sliding_joints(motion.dynamics.plant)
-    return {
-        f"{joint}.effort": InUnits(
+    units, by_block = {}, {}
+    block = motion.blocks().reshape(-1, n)[rows, 0]
+    squares = [motion.in_noise(r).reshape(-1, n)[rows] ** 2 for r in both]
+    for k, (what, joint) in enumerate(motion.names()):
+        if what != "effort" or not len(block):
+            continue
+        name = f"{joint}.effort"
+        units[name] = InUnits(
             "N" if joint in slides else "N m", rms(left[0][rows, k]),
             rms(left[1][rows, k]), rms(noise[rows, k]),
+        )  # fmt: skip
+        by_block[name] = np.array(
+            [[np.mean(s[block == b, k]) for b in np.unique(block)] for s in squares]
         )
-        for k, (what, joint) in enumerate(motion.names())
-        if what == "effort"
-    }  # fmt: skip
+    return units, by_block
 
 
 def _twists(motion: InverseModel, effects: Sequence[Effect]):

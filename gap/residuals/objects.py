@@ -22,7 +22,12 @@ from makebreak.gap.residuals.touch import TouchModel, touch_candidates
 from makebreak.gap.residuals.where import where_in_windows
 from makebreak.gap.result import Unexplained, Where
 from makebreak.gap.simulation.free_windows import FreeBodyModel, touched
-from makebreak.gap.simulation.measure import gap_measure, series_of, unseen_series
+from makebreak.gap.simulation.measure import (
+    gap_measure,
+    series_of,
+    unseen_series,
+    why_stopped,
+)
 from makebreak.gap.simulation.windows import WindowModel
 from makebreak.models.effects.contact import STIFFNESS
 from makebreak.models.scene import Scene
@@ -100,7 +105,12 @@ class WindowedProblem(GapProblem):
 
     def where(self, left: np.ndarray) -> list[Where]:
         model = self._model()
-        return where_in_windows(model, model.errors(model.simulate(())))
+        simulated = model.simulate(())
+        ended = [
+            e if np.isfinite(y[~np.isnan(y)]).all() else e[:0]
+            for e, y in zip(model.errors(simulated), simulated, strict=True)
+        ]
+        return where_in_windows(model, ended)
 
     def outcome(
         self, effects, start: Fitted, end: Fitted, nuisances: Nuisances,
@@ -117,11 +127,20 @@ class WindowedProblem(GapProblem):
         if not any(held):
             return None
         before, after = model.simulate(()), model.simulate(effects)
+
+        def why(k: int, with_effects: bool) -> str:
+            if not isinstance(model, WindowModel):
+                return ""
+            return why_stopped(model, effects if with_effects else (), k)
+
+        gap = gap_measure(model, before, after, held, why)
+        if not gap.is_measured:
+            return Outcome(gap)
         series = series_of(model, before, after, held)
         if isinstance(model, WindowModel):
             series += unseen_series(model, effects, held)
         return Outcome(
-            gap_measure(model, before, after, held),
+            gap,
             series,
             unexplained_in_windows(model, after),
             where=where_in_windows(model, model.errors(before)) if recordings else (),
@@ -247,7 +266,11 @@ def unexplained_in_windows(
 ) -> list[Unexplained]:
     """Of each channel what is left, while what, and what its size goes with."""
     errors = model.errors(simulated)
-    used = [k for k, e in enumerate(errors) if len(e)]
+    used = [
+        k for k, e in enumerate(errors) if len(e) and not np.isinf(simulated[k]).any()
+    ]
+    if not used:
+        return []
     names = model.channels
     features: dict[str, list[np.ndarray]] = {}
     for k in used:

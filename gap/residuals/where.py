@@ -62,10 +62,11 @@ def where_in_motion(model: InverseModel, left: np.ndarray) -> list[Where]:
 
 
 def where_in_windows(model: Any, errors: Sequence[np.ndarray]) -> list[Where]:
-    """Windows whose end is not where the scene would have it."""
+    """Windows whose end is not where the scene would have it; those that could not be
+    simulated to their end say nothing."""
     found, p = [], []
     for w, e in zip(model.windows, errors, strict=True):
-        if not len(e):
+        if not len(e) or not np.isfinite(e).all():
             continue
         recording = model.recordings[w.recording]
         time = recording.time[w.rows]

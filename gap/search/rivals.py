@@ -34,6 +34,7 @@ from makebreak.gap.thresholds import (
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 
+HARDLY_CHANGED = 0.02  # Of the equation that an effect changes most.
 NO_MASS = 0.01  # Of a body's mass: what is left at the end of its range.
 
 
@@ -252,14 +253,58 @@ def still_tied(
         except ValueError:
             continue
         search.say(f"  {called(rival)}, as a tie: {fit.score:.3g}")
-        near = search.error(fit.score) <= (1.0 + SAME_ERROR) * search.error(
-            current.score
-        )
-        more = identifiable(current, k) - identifiable(fit, k)
-        worse = search.is_worse(fit, current, more) or search.is_louder(fit, current)
-        if near and search.is_alike(fit, current) and not worse:
+        if _does_as_well(search, fit, current, k):
             tied.append(fit.effects[k])
     return tuple(tied)
+
+
+def _does_as_well(search: Comparison, fit: Fitted, current: Fitted, k: int) -> bool:
+    """Whether a fit with another k-th effect explains the data as well."""
+    near = search.error(fit.score) <= (1.0 + SAME_ERROR) * search.error(current.score)
+    more = identifiable(current, k) - identifiable(fit, k)
+    worse = search.is_worse(fit, current, more) or search.is_louder(fit, current)
+    return near and search.is_alike(fit, current) and not worse
+
+
+def with_shared_gains(
+    search: Comparison, chosen: Sequence[Choice], current: Fitted
+) -> list[Choice]:
+    """The choices, each with one more tie where one gain, shared by all drives whose
+    equations it changes, explains the data as well: of what moves in a plane, two
+    drives that give too little are a body that is too heavy."""
+    out = list(chosen)
+    if search.plan.jumps or all(c.in_group for c in chosen):
+        return out
+    gains = [
+        c for c in search.problem.candidates(search.nuisances, current)
+        if KINDS[c.kind].path == "gain" and not c.members and len(c.at) == 1
+        and [x.shape[1] for x in c.columns] == [1]
+    ]  # fmt: skip
+    for k, choice in enumerate(chosen):
+        if choice.in_group or choice.effect.kind in {c.kind for c in gains}:
+            continue
+        rest = search.without(current.effects, k)
+        try:
+            change = search.problem.residual(rest) - current.r
+        except (ValueError, RuntimeError):
+            continue
+        size = [rms(change[c.columns[0][:, 0] != 0.0]) for c in gains]
+        least = HARDLY_CHANGED * max(size, default=0.0)
+        shared = [c for c, x in zip(gains, size, strict=True) if x > least]
+        if len(shared) < 2:
+            continue
+        columns = np.sum([c.columns[0] for c in shared], axis=0)
+        one = Candidate(
+            shared[0].kind, tuple(c.at[0] for c in shared), 1, (columns,),
+            shared[0].to_parameters,
+        )  # fmt: skip
+        found = in_place_of(search, one, k, chosen, current)
+        if found is None or not uses_all_parameters(found.fit, k):
+            continue
+        if _does_as_well(search, found.fit, current, k):
+            tie = found.fit.effects[k]
+            out[k] = replace(choice, ties=(*choice.ties, tie))
+    return out
 
 
 def with_rivals_of_pairs(

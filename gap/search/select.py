@@ -38,7 +38,11 @@ from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.search.drop import drop_needless, keep_certain, simplify
 from makebreak.gap.search.forward import forward
 from makebreak.gap.search.own_values import with_own_values
-from makebreak.gap.search.rivals import still_tied, with_rivals_of_pairs
+from makebreak.gap.search.rivals import (
+    still_tied,
+    with_rivals_of_pairs,
+    with_shared_gains,
+)
 from makebreak.gap.search.sets import with_rival_sets
 from makebreak.models.effects.kind import Effect
 
@@ -89,6 +93,7 @@ def _with_ties(
         replace(c, ties=still_tied(search, chosen, current, k))
         for k, c in enumerate(chosen)
     ]
+    chosen = with_shared_gains(search, chosen, current)
     return with_rival_sets(search, chosen, current)
 
 
@@ -105,14 +110,21 @@ def _reweighed(
     return refreshed(chosen, current), current
 
 
-def without(problem: GapProblem, selection: Selection, effect: Effect) -> Selection:
-    """A selection less the effect of that kind and place, all others fitted again."""
+def without(problem: GapProblem, selection: Selection, *effects: Effect) -> Selection:
+    """A selection less the effects of these kinds and places, all others fitted again;
+    less all of them where the others cannot be without these."""
+    gone = {(e.kind, tuple(e.at)) for e in effects}
     rest = [
-        c for c in selection.choices
-        if (c.effect.kind, list(c.effect.at)) != (effect.kind, list(effect.at))
-    ]  # fmt: skip
-    fitted = fit_effects(
-        problem, selection.screen(problem), [c.effect for c in rest],
-        fixed_parameters(rest),
-    )  # fmt: skip
-    return replace(selection, choices=tuple(refreshed(rest, fitted)), end=fitted)
+        c for c in selection.choices if (c.effect.kind, tuple(c.effect.at)) not in gone
+    ]
+    if rest:
+        try:
+            fitted = fit_effects(
+                problem, selection.screen(problem), [c.effect for c in rest],
+                fixed_parameters(rest),
+            )  # fmt: skip
+            kept = tuple(refreshed(rest, fitted))
+            return replace(selection, choices=kept, end=fitted)
+        except (ValueError, RuntimeError):
+            pass
+    return replace(selection, choices=(), end=selection.start)

@@ -1,6 +1,6 @@
 """The gap before and after, over held-out windows simulated from measured states."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -34,15 +34,37 @@ class Windows(Protocol):
     ) -> list[np.ndarray]: ...
 
 
-def gap_measure(model: Windows, before, after, held: Sequence[bool]) -> GapMeasure:
-    """Args: before, after: what windows simulate without and with effects; held: which
-    windows count. Samples that were not measured, or that one of them does not tell,
-    and windows that one of them does not finish, count in neither."""
+def gap_measure(
+    model: Windows,
+    before,
+    after,
+    held: Sequence[bool],
+    why: Callable[[int, bool], str] = lambda k, with_effects: "",
+) -> GapMeasure:
+    """The gap over the windows that both simulate to their end.
+
+    Args: before, after: what windows simulate without and with effects; held: which
+        windows count. Samples that were not measured, or that one of them does not
+        tell, count in neither. why: why the simulation of window k stopped short,
+        without or with the effects.
+    Returns: a measure of nothing (is_measured) where no window is simulated to its end.
+    """
     picked = [k for k, h in enumerate(held) if h]
     failed = [
         [bool(np.isinf(each[k]).any()) for k in picked] for each in (before, after)
     ]
-    whole = [k for k, *f in zip(picked, *failed, strict=True) if not any(f)] or picked
+    whole = [k for k, *f in zip(picked, *failed, strict=True) if not any(f)]
+    count = sum(failed[0]), sum(failed[1])
+    failure = ""
+    if any(count):
+        with_effects = not any(failed[0])
+        k = picked[failed[with_effects].index(True)]
+        failure = _failure(model, k, why(k, with_effects), with_effects)
+    if not whole:
+        return GapMeasure(
+            np.nan, np.nan, NOISE_FLOOR, 0.0,
+            n_windows=len(picked), failed=count, failure=failure,
+        )  # fmt: skip
 
     def of_whole(each) -> np.ndarray:
         return np.concatenate([each[k] for k in whole])
@@ -58,6 +80,20 @@ def gap_measure(model: Windows, before, after, held: Sequence[bool]) -> GapMeasu
 
     stds_of_whole = of_whole(stds)
     everything = slice(None)
+
+    def by_window(c) -> np.ndarray:
+        """(2, 2, n) mean squares over the expected error, and over the noise."""
+        first = np.cumsum([0, *(len(before[k]) for k in whole)])[:-1]
+        n = np.add.reduceat(both[:, c].astype(float), first)
+        over_noise = [each[:, c] / model.noise[c] for each in plain]
+        squares = [
+            np.add.reduceat(np.where(both[:, c], e, 0.0) ** 2, first)
+            for e in (over[0][:, c], over[1][:, c], *over_noise)
+        ]
+        found = np.full((4, len(picked)), np.nan)
+        found[:, [picked.index(k) for k in whole]] = squares / np.where(n, n, np.nan)
+        return found.reshape(2, 2, -1)
+
     sliding = sliding_joints(model.dynamics.plant)
     recordings = model.recordings
     return GapMeasure(
@@ -75,11 +111,13 @@ def gap_measure(model: Windows, before, after, held: Sequence[bool]) -> GapMeasu
             )
             for c, name in enumerate(model.channels)
         },
-        {}, len(picked), (sum(failed[0]), sum(failed[1])),
+        {}, len(picked), count,
         seconds=float(sum(
             np.ptp(recordings[w.recording].time[w.rows])
             for w in (model.windows[k] for k in picked)
         )),
+        failure=failure,
+        by_window={name: by_window(c) for c, name in enumerate(model.channels)},
     )  # fmt: skip
 
 
@@ -104,6 +142,28 @@ def _off(model: Windows, simulated: Sequence[np.ndarray]) -> list[np.ndarray]:
     return out
 
 
+def why_stopped(model: WindowModel, effects: Sequence[Effect], k: int) -> str:
+    """Why the simulation of window k with these effects stops short; "": not known."""
+    try:
+        model.simulate(effects, [j == k for j in range(len(model.windows))])
+    except ValueError as error:  # The scene cannot have them.
+        return str(error)
+    return model.simulation.failure
+
+
+def _failure(model: Windows, k: int, why: str, with_effects: bool) -> str:
+    """Which window could not be simulated to its end, and why, as a sentence."""
+    w = model.windows[k]
+    recording = model.recordings[w.recording]
+    time = recording.time[w.rows]
+    beside = " with the effects" if with_effects else ""
+    why = why or "the state grew beyond all numbers"
+    return (
+        f"The simulation{beside} of {recording.name} from {time[0]:.4g} to "
+        f"{time[-1]:.4g} s (episode {w.episode}) stopped: {why.rstrip('.')}."
+    )
+
+
 def series_of(
     model: Windows, before, after, held: Sequence[bool], most: int = MOST_SHOWN
 ) -> list[Series]:
@@ -123,8 +183,8 @@ def series_of(
         out.append(
             Series(
                 channel, recording.name, first.episode, time, seen,
-                np.concatenate([before[k][:, c] for k in same]),
-                np.concatenate([after[k][:, c] for k in same]),
+                _drawn(np.concatenate([before[k][:, c] for k in same])),
+                _drawn(np.concatenate([after[k][:, c] for k in same])),
                 starts, float(model.noise[c]), expected[:, c],
             )
         )  # fmt: skip
@@ -155,3 +215,8 @@ def _shown(model: Windows, held: Sequence[bool], most: int = MOST_SHOWN) -> list
         == (first.recording, first.episode)
     ]  # fmt: skip
     return same[:most]
+
+
+def _drawn(y: np.ndarray) -> np.ndarray:
+    """(n,) without what is infinite: a simulation that stopped."""
+    return np.where(np.isinf(y), np.nan, y)
