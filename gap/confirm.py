@@ -185,7 +185,7 @@ def _worse_places(gap: GapMeasure) -> list[tuple[str, str, bool]]:
     for name, of in gap.equations.items():
         noise = max(of.noise, 1e-300)
         if is_worse(of.before / noise, of.after / noise, gap.by_block.get(name)):
-            place = name.removesuffix(" equation")
+            place = name.removesuffix(" equation").removesuffix(".effort")
             why = (
                 f"With it the error in the equation of motion of {place} goes from "
                 f"{figure(of.before)} to {figure(of.after)} {of.unit} on held-out data."

@@ -1,0 +1,147 @@
+"""What data held out for the report do to the effects that a search has chosen."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_gap_forward import Columns, directions
+
+from makebreak.gap.confirm import acts_on, confirmed, is_worse
+from makebreak.gap.fit import fit_effects
+from makebreak.gap.numerics.selection import Screen
+from makebreak.gap.problem import Outcome
+from makebreak.gap.result import GapMeasure, InUnits
+from makebreak.gap.search.choice import Choice, Selection
+from makebreak.gap.verdict import Facts, decide
+from makebreak.models.effects.kind import Effect
+
+KIND, JOINTS = "joint_coulomb_friction", ("arm.j1", "arm.j2", "arm.j3")
+
+
+class Held(Columns):
+    """Frictions at three joints, each with a column of its own, and what held-out
+    windows show at each joint with and without them: {joint: (without, with)}."""
+
+    def __init__(self, shown, tie: float | None = None):
+        columns = directions(3).T[:, :, None]
+        of = {(KIND, j): x for j, x in zip(JOINTS, columns, strict=True)}
+        super().__init__(of, {key: 4.0 for key in of})
+        self.shown, self.tie, self.calls = shown, tie, 0
+
+    def outcome(self, effects, start, end, nuisances, recordings=None, jobs=1):
+        self.calls += 1
+        there = {at for e in effects for at in e.at}
+        per, windows = {}, {}
+        for joint, (without, with_) in self.shown.items():
+            after = with_ if joint in there else without
+            if any(e.kind != KIND for e in effects):
+                after = self.tie if self.tie is not None else after
+            per[f"{joint}.position"] = {"before": without, "after": after}
+            squares = np.array([[without**2] * 9, [after**2] * 9])
+            windows[f"{joint}.position"] = np.stack([squares, squares])
+        a, b = (
+            float(np.sqrt(np.mean([p[when] ** 2 for p in per.values()])))
+            for when in ("before", "after")
+        )
+        gap = GapMeasure(a, b, 1.0, 0.3, per, n_windows=9, by_window=windows)
+        return Outcome(gap)
+
+
+def selection_of(problem: Held, joints=JOINTS, **more) -> Selection:
+    effects = [Effect(KIND, [j], {"coulomb": 4.0}) for j in joints]
+    none = problem.nuisances()
+    screen = Screen(problem.base(), none.columns, none.prior, problem.train())
+    start, end = (fit_effects(problem, screen, e) for e in ([], effects))
+    choices = tuple(
+        Choice(e, s, 9.0, 1.0, "", 1.0, (), (), 1, in_group=True, **more)
+        for e, s in zip(end.effects, end.std, strict=True)
+    )
+    return Selection(choices, start, end, none)
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_what_stays_makes_held_out_data_no_worse_as_a_whole_and_at_each_joint(seed):
+    rng = np.random.default_rng(seed)
+    shown = {j: tuple(np.exp(rng.uniform(0.0, 3.0, 2))) for j in JOINTS}
+    problem = Held(shown)
+    found = confirmed(problem, selection_of(problem), ["held out"])
+    gap, stays = found.outcome.gap, found.selection.effects()
+    # The figures are those of what stays, and nothing is lost on the way.
+    again = problem.outcome(stays, None, None, None)
+    assert (gap.before, gap.after) == (again.gap.before, again.gap.after)
+    assert len(stays) + len(found.vetoed) == 3
+    assert found.selection.end.effects == tuple(stays)
+    # A twentieth is chance, and 1.15 times the noise is no error.
+    assert gap.after <= 1.05 * max(gap.before, 1.15)
+    for effect in stays:
+        without, with_ = shown[effect.at[0]]
+        assert with_ <= 1.05 * max(without, 1.15)
+    for choice, why in found.vetoed:
+        assert why and "nan" not in why and "inf" not in why
+        without, with_ = shown[choice.effect.at[0]]
+        assert with_ > without or gap.reduction < 0.5
+
+
+def test_one_joint_of_a_group_goes_and_the_others_stay():
+    problem = Held({"arm.j1": (9.0, 1.0), "arm.j2": (4.8, 8.6), "arm.j3": (9.0, 1.0)})
+    found = confirmed(problem, selection_of(problem), ["held out"])
+    assert [e.at for e in found.selection.effects()] == [["arm.j1"], ["arm.j3"]]
+    ((choice, why),) = found.vetoed
+    assert choice.effect.at == ["arm.j2"] and "from 4.8 to 8.6" in why
+
+
+def test_a_joint_s_own_equation_vetoes_too():
+    class WithEquations(Held):
+        def outcome(self, effects, *of, **more):
+            found = super().outcome(effects, *of, **more)
+            there = any("arm.j2" in e.at for e in effects)
+            of_j2 = InUnits("N m", 4.8, 8.6 if there else 4.8, 0.1)
+            return replace(
+                found, gap=replace(found.gap, equations={"arm.j2.effort": of_j2})
+            )
+
+    problem = WithEquations(
+        {"arm.j1": (9.0, 1.0), "arm.j2": (2.0, 1.9), "arm.j3": (9.0, 1.0)}
+    )
+    found = confirmed(problem, selection_of(problem), ["held out"])
+    ((choice, why),) = found.vetoed
+    assert choice.effect.at == ["arm.j2"] and "4.8 to 8.6 N m" in why
+
+
+@pytest.mark.parametrize("with_tie, kept", [(38.0, False), (1.1, True)])
+def test_a_tie_that_leaves_the_gap_in_simulation_is_none(with_tie, kept):
+    problem = Held({j: (40.0, 1.0) for j in JOINTS[:1]}, tie=with_tie)
+    tie = Effect("actuator_bias", ["arm.j1"], {"bias": 1.0})
+    selection = selection_of(problem, JOINTS[:1])
+    (choice,) = selection.choices
+    tied = replace(selection, choices=(replace(choice, ties=(tie,)),))
+    (choice,) = confirmed(problem, tied, ["held out"]).selection.choices
+    assert bool(choice.ties) == kept
+
+
+def test_a_little_more_in_every_window_is_worse_and_in_some_is_chance():
+    rng = np.random.default_rng(0)
+    before = 4.0 + rng.normal(size=40) * 0.1
+    surely, maybe = before + 0.1, before + rng.normal(size=40)
+    maybe += np.mean(before) + 0.1 - np.mean(maybe)
+    assert is_worse(2.0, 2.02, np.stack([before, surely]))
+    assert not is_worse(2.0, 2.02, np.stack([before, maybe]))
+    assert is_worse(2.0, 2.2)
+    assert not is_worse(0.6, 1.1)  # What a right model may leave.
+
+
+def test_an_effect_acts_on_its_joint_its_model_and_its_pair():
+    problem = Held({})
+    for at, place, acts in (
+        ("arm.j1", "arm.j1", True), ("arm.j1", "arm.j10", False),
+        ("arm.j1.velocity", "arm.j1", True), ("arm", "arm.j2", True),
+        ("a.a~b.b", "b.b", True), ("world", "arm.j1", True),
+    ):  # fmt: skip
+        assert acts_on(problem, Effect(KIND, [at]), place) == acts
+
+
+def test_a_simulation_that_stopped_is_no_evidence():
+    stopped = GapMeasure(np.nan, np.nan, 1.0, 0.0, failure="It stopped: why.")
+    facts = Facts((), 1.0, 1.0, chosen_on=stopped, asks_simulation=True)
+    assert decide(facts)[0] == "not_judged"
+    assert decide(replace(facts, asks_simulation=False))[0] == "no_gap"
