@@ -53,7 +53,9 @@ GAP_ROOMS = {
     "search": {"shared", "data", "simulation", "residuals", "search"},
     "report": {"shared", "data", "simulation", "report"},
 }
-GAP_TOGETHER = ("__init__", "workflow", "by_recording", "at_impacts", "verdict")
+GAP_TOGETHER = (
+    "__init__", "workflow", "by_recording", "at_impacts", "verdict", "confirm",
+)  # fmt: skip
 
 
 def gap_room_of(parts):

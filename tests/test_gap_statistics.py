@@ -1217,7 +1217,7 @@ def test_an_agreement_that_simulation_does_not_show_at_the_end_is_taken_back(
     assert found == verdict and (said in words) and bool(words) == bool(said)
 
 
-@pytest.mark.parametrize("after, closed", [(8.04, "12%"), (5.2, "47%")])
+@pytest.mark.parametrize("after, closed", [(8.04, "12%"), (5.24, "47%")])
 def test_candidates_that_close_too_little_are_told_with_their_value(after, closed):
     facts = Facts([a_backlash()], 9.0, after, chosen_on=windows_leave(9.0, after))
     why = too_weak(facts, 1.0 - (after - 1.0) / 8.0)
