@@ -33,6 +33,8 @@ def impacts_differ(
     found = _at_impacts(problem, effects)
     if between.verdict not in EXPLAINED or not found or outcome is None:
         return None
+    if not outcome.gap.is_measured or outcome.gap.after > outcome.gap.before:
+        return None  # Whole windows get worse with what is named between impacts.
     gap = replace(outcome.gap, data=between.gap.data)
     return replace(
         between, verdict="gap_unnamed", says=f"Between impacts: {between.says} {found}",

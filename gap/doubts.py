@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from makebreak.gap.data.findings import GUESSED_GAINS, NO_COLUMN, NO_DRIVE, TOOL_WEIGHT
-from makebreak.gap.result import AGREES, GapResult
+from makebreak.gap.result import AGREES, GapResult, Tried
 from makebreak.gap.thresholds import UNEXPLAINED_RMS
 
 
@@ -58,6 +58,10 @@ def unless_doubtful(result: GapResult) -> GapResult:
         verdict="gap_unnamed",
         says=says,
         effects=[],
+        tried=[
+            *result.tried,
+            *(Tried(e.kind, e.at, e.parameters, e.says, says) for e in result.effects),
+        ],
         differs=(),
         gap=gap,
         series=[replace(each, after=each.before) for each in result.series],

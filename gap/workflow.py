@@ -587,8 +587,8 @@ def _says_failure(gap: GapMeasure) -> str:
         text = f"{count} of {gap.n_windows} windows could not be simulated to their end"
         return f" {text} and do not count. {gap.failure}"
     return (
-        " No window could be simulated to its end, so the errors are those of the data "
-        f"before simulation. {gap.failure}"
+        " No window could be simulated to its end, so the errors are those of what was "
+        f"compared without simulation. {gap.failure}"
     )
 
 
