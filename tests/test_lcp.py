@@ -1,4 +1,5 @@
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -220,6 +221,82 @@ def test_the_smallest_cube_problems_agree_with_drakes_moby_solver_in_motion():
         ours = F @ solve_lcp(F, q)
         np.testing.assert_allclose(ours, F @ lam, atol=1e-7 * size)
     assert compared > 15
+
+
+def flat_body_in_a_turned_world(rng, eps_c):
+    """The LCP of Stewart and Trinkle, unknowns [normal, friction, sliding speed], of a
+    body that moves in a plane which is no plane of the world's axes. Across the plane
+    nothing moves; what stands there in F and q is rounding. Some contacts are
+    doubled."""
+    (m, a, dt), n = 10.0 ** rng.uniform([-6, -2, -3], [6, 0, -1]), rng.integers(1, 6)
+    R = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    across = R @ [0.0, 1.0, 0.0]
+    S = np.zeros((6, 3))  # Twist [w, v] of [x, z, turn].
+    S[3:, 0], S[3:, 1], S[:3, 2] = R[:, 0], R[:, 2], across
+    M_inv, J_n, J_t = np.diag([1.0 / m, 1.0 / m, 6.0 / (m * a**2)]), [], []
+    for _ in range(n):
+        if not J_n or rng.random() < 0.7:
+            p = R @ (0.5 * a * rng.choice([-1.0, 1.0], 3) * [1, 0, 1])
+            angle = rng.choice([0.5 * np.pi, 2.0 * np.pi * rng.random()])
+            normal = R @ [np.cos(angle), 0.0, np.sin(angle)]
+            along = np.cross(across, normal)
+        row = [np.concatenate([np.cross(p, e), e]) @ S for e in (normal, along, across)]
+        J_n.append(row[0])
+        J_t += [row[1], -row[1], row[2], -row[2]]
+    J, mu = np.array(J_n + J_t), rng.choice([0.1, 0.5, 1.0])
+    E_t, v = np.kron(np.eye(n), np.ones((4, 1))), rng.normal(size=3)
+    v = v * rng.choice([0.0, 0.1, 1.0]) - dt * 9.81 * np.eye(3)[1]
+    F, q = np.zeros((6 * n, 6 * n)), np.zeros(6 * n)
+    F[: len(J), : len(J)] = dt * (J @ M_inv @ J.T + eps_c * np.eye(len(J)))
+    F[n : len(J), len(J) :] = E_t
+    F[len(J) :, :n], F[len(J) :, n : len(J)] = mu * np.eye(n), -E_t.T
+    q[: len(J)] = J @ v
+    q[:n] += rng.choice([0.0, 0.01 * a], n) / dt
+    return F, q, 5 * n
+
+
+@pytest.mark.parametrize("eps_c", [0.0, 0.01])
+def test_directions_in_which_nothing_moves_set_no_scale(eps_c):
+    # F[i, i] of 1e-32 made forces 700 times outside of the friction cone look right.
+    rng, touching = np.random.default_rng(0), 0
+    for _ in range(200):
+        F, q, n = flat_body_in_a_turned_world(rng, eps_c)
+        order = rng.permutation(q.size)
+        lam = np.empty(q.size)
+        lam[order] = solve_lcp(F[np.ix_(order, order)], q[order])
+        w, speed = F @ lam + q, np.abs(q).max()
+        force = max(lam[:n].max(), 1e-6 * speed / np.diag(F).max())
+        touching += lam[:n].max() > 0.0
+        assert w[:n].min() > -1e-8 * speed and w[n:].min() > -1e-8 * force
+        assert np.minimum(w[:n] / speed, lam[:n] / force).max() < 1e-8
+        assert np.minimum(w[n:] / force, lam[n:] / speed).max() < 1e-8
+        # No force does work that nobody put in: the motion loses energy.
+        v_lam = F[:n, :n] @ lam[:n]
+        assert lam[:n] @ (0.5 * v_lam + q[:n]) <= 1e-8 * speed * force
+    assert touching > 80
+
+
+def test_friction_of_a_flat_cube_stays_within_its_cone():
+    # From the contacts of a planar cube with two fingers, [sliding speeds, normals,
+    # edges]; F[i, i] of the edges out of the plane is 1e-25.
+    case = np.load(Path(__file__).parent / "reference" / "lcp_st_cube.npz")
+    F, q = case["F"], case["q"]
+    lam, mu = solve_lcp(F, q), F[[0, 1, 2], [3, 4, 5]]
+    edges = lam[6:].reshape(3, 4)
+    assert (edges.sum(axis=1) <= mu * lam[3:6] + 1e-9 * lam.max()).all()
+    # What moves is what moves with zeros in the place of the rounding.
+    exact = np.where(np.abs(F) < 1e-20, 0.0, F)
+    np.testing.assert_allclose(
+        F[3:, 3:] @ lam[3:], exact[3:, 3:] @ solve_lcp(exact, q)[3:], atol=1e-9
+    )
+
+
+@pytest.mark.parametrize("decades", [2, 6])
+def test_a_light_body_beside_a_heavy_one_is_solved_on_its_own_scale(decades):
+    # Two blocks, each on a table: the closed form holds for each to the same digits.
+    m, dt = np.array([10.0**decades, 10.0**-decades]), 0.01
+    lam = solve_lcp(np.diag(dt / m), np.full(2, -9.81 * dt))
+    np.testing.assert_allclose(lam, 9.81 * m, rtol=1e-12)
 
 
 @settings(max_examples=150, deadline=None, derandomize=True)

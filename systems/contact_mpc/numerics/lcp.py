@@ -24,6 +24,8 @@ REBUILD = 10
 # Largest force z, in units in which diag(M) and max |b| are 1, that counts as the scale
 # of a rounding error; larger ones are no excuse for a breach of w >= 0.
 Z_SCALE_MAX = 1e2
+# Least scale of a row in these units: terms of 1e-15 or less are rounding.
+ROW_MIN = 1e-6
 # Status of solve_lcp_kernel.
 SOLVED, NO_SOLUTION, NOT_PRECISE = 0, 1, 2
 
@@ -36,7 +38,8 @@ def solve_lcp(F, q):
         q: (n,) gap velocities without contact force [m/s].
 
     Returns: lam (n,) [N], every entry >= 0. w = F lam + q holds w >= 0 and w lam = 0 to
-        1e-9 of the problem's own scale (to 1e-7 where no such lam is found).
+        1e-9 of each row's own terms (to 1e-7 where no such lam is found), see
+        _violation.
 
     Raises: ValueError on wrong shapes, entries that are not finite, and when there is
         no solution (or, for F that is not positive semi-definite, none was found).
@@ -77,22 +80,11 @@ def solve_lcp_kernel(F, q):
                 return lam, NOT_PRECISE
     if worst == 0.0:
         return lam, SOLVED
-    # The same LCP in units in which F has a diagonal of ones and the largest |q| is 1,
-    # so that the tolerances below mean the same for grams and for tonnes.
-    scale, largest = np.ones(n), 0.0
+    # The same LCP in units in which F has a diagonal of ones and the most negative q is
+    # -1, so that the tolerances below mean the same for grams and for tonnes.
+    scale, largest = _units(F), 0.0
     for i in range(n):
-        if F[i, i] > 0.0:
-            scale[i] = 1.0 / np.sqrt(F[i, i])
-    for i in range(n):  # A sliding speed: beside the largest of its contact's forces.
-        if not F[i, i] > 0.0:
-            most = 0.0
-            for j in range(n):
-                if F[j, j] > 0.0:
-                    most = max(most, scale[j] * max(abs(F[i, j]), abs(F[j, i])))
-            if most > 0.0:
-                scale[i] = 1.0 / most
-    for i in range(n):
-        largest = max(largest, scale[i] * abs(q[i]))
+        largest = max(largest, -scale[i] * q[i])
     M, b = np.empty((n, n)), np.empty(n)
     for i in range(n):
         b[i] = scale[i] * q[i] / largest
@@ -130,6 +122,48 @@ def solve_lcp_kernel(F, q):
     for i in range(n):
         lam[i] = scale[i] * largest * z[i]
     return lam, SOLVED
+
+
+@njit(cache=True)
+def _units(F):
+    """The unit of each row and force, (n,): 1 / sqrt(F[i, i]), where that is not zero.
+
+    A sliding speed (F[i, i] = 0, and F[i, j] = -F[j, i] but for scale: its friction
+    edges) has the unit of the edge that moves most, and all its edges have that one. So
+    F[i, i] that is rounding instead of zero, of an edge along which nothing can move,
+    makes no unit; where nothing moves along any edge, the normal force does.
+    """
+    n = len(F)
+    unit, is_pair = np.ones(n), np.zeros((n, n), np.bool_)
+    for i in range(n):
+        if F[i, i] > 0.0:
+            unit[i] = 1.0 / np.sqrt(F[i, i])
+    for i in range(n):
+        if F[i, i] > 0.0:
+            continue
+        largest, most, least = 0.0, 0.0, np.inf
+        for j in range(n):
+            largest = max(largest, -F[i, j] * F[j, i])
+        for j in range(n):
+            is_pair[i, j] = -F[i, j] * F[j, i] > 1e-12 * largest
+            if F[j, j] > 0.0:
+                if is_pair[i, j]:
+                    least = min(least, unit[j] * np.sqrt(-F[i, j] * F[j, i]))
+                else:
+                    most = max(most, unit[j] * max(abs(F[i, j]), abs(F[j, i])))
+        if least == np.inf:
+            is_pair[i] = False  # An edge along which nothing moves.
+        if least == np.inf or least > 1e6 * most > 0.0:
+            least = most
+        if least > 0.0:
+            unit[i] = 1.0 / least
+    for i in range(n):
+        for j in range(n):
+            if is_pair[i, j]:
+                most = 1.0 / (unit[i] * np.sqrt(-F[i, j] * F[j, i]))
+                if not F[j, j] > 0.0 or most < unit[j]:
+                    unit[j] = most
+    return unit
 
 
 @njit(cache=True)
@@ -316,16 +350,36 @@ def _read(T, M, b, basic, z):
 
 @njit(cache=True)
 def _violation(M, b, z):
-    """Largest breach of w >= 0 and of w z = 0, of the scale of the terms (up to
-    Z_SCALE_MAX: beside forces without bound any breach would be small)."""
-    worst, largest = 0.0, 1.0
-    for i in range(b.size):
-        largest = max(largest, min(z[i], Z_SCALE_MAX))
-    for i in range(b.size):
-        w = b[i]
-        for j in range(b.size):
-            w += M[i, j] * z[j]
-        if not np.isfinite(w):
+    """Largest breach of w >= 0 and of w z = 0, each row's beside its own terms.
+
+    A force counts with at most Z_SCALE_MAX: beside forces without bound any breach
+    would be small. Rows that share a sliding speed (a column with zero on the diagonal)
+    have its unit, and the largest of their scales. A force is zero where no row would
+    notice if it were.
+    """
+    n, worst = b.size, 0.0
+    w, terms = b.copy(), np.abs(b)
+    for i in range(n):
+        for j in range(n):
+            w[i] += M[i, j] * z[j]
+            terms[i] += abs(M[i, j]) * min(z[j], Z_SCALE_MAX)
+        if not np.isfinite(w[i]):
             return np.inf  # Comparisons with what is not a number are all false.
-        worst = max(worst, -w, min(abs(w), z[i]))
-    return worst / largest
+    size = np.maximum(terms, ROW_MIN)
+    for j in range(n):
+        if M[j, j] == 0.0:
+            shared = 0.0
+            for i in range(n):
+                shared = max(shared, min(abs(M[i, j]), 1.0) * terms[i])
+            for i in range(n):
+                size[i] = max(size[i], min(abs(M[i, j]), 1.0) * shared)
+    for i in range(n):
+        breach = abs(w[i])
+        if w[i] > 0.0 and breach > worst * size[i]:
+            noticed = 0.0
+            for k in range(n):
+                noticed = max(noticed, abs(M[k, i]) * z[i] / size[k])
+            breach = min(breach, noticed * size[i])
+        if breach > worst * size[i]:
+            worst = breach / size[i]
+    return worst
