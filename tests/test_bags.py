@@ -194,3 +194,45 @@ def test_a_dataset_without_its_columns_is_refused(tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(ValueError, match="a bag .* or a LeRobot dataset"):
         read_recording(tmp_path / "empty")
+
+
+def two_clocks(path, slope):
+    """A simulator's JointStates, stamped by its clock from 5 s on, which runs `slope`
+    times as fast as the wall's; commands have no header. Both show the same motion."""
+    from rosbags import rosbag2
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    names = ("sensor_msgs/msg/JointState", "std_msgs/msg/Float64MultiArray",
+             "std_msgs/msg/MultiArrayLayout", "std_msgs/msg/Header",
+             "builtin_interfaces/msg/Time")  # fmt: skip
+    State, Array, Layout, Header, Time = (store.types[name] for name in names)
+    with rosbag2.Writer(path, version=9) as writer:
+        states = writer.add_connection("/joint_states", names[0], typestore=store)
+        told = writer.add_connection("/effort/commands", names[1], typestore=store)
+        for k in range(N):
+            wall, sim = START + PERIOD * k, 5 * 10**9 + int(slope * PERIOD * k)
+            q = np.full(1, position(1e-9 * (sim - 5 * 10**9), 0))
+            header = Header(Time(sim // 10**9, sim % 10**9), "")
+            state = State(header, JOINTS[:1], q, q, q)
+            writer.write(states, wall, store.serialize_cdr(state, names[0]))
+            message = Array(Layout([], 0), q)
+            writer.write(told, wall, store.serialize_cdr(message, names[1]))
+
+
+@pytest.mark.parametrize("slope", [1.0, 0.5])
+def test_topics_of_two_clocks_are_brought_to_one_and_it_is_said(
+    tmp_path, rosbags, slope
+):
+    two_clocks(tmp_path / "bag", slope)
+    table = read_table(tmp_path / "bag")
+    time = table.columns["time"]
+    assert [kind for kind, _ in table.notes] == ["clocks_differ"]
+    says = table.notes[0][1]
+    assert "/joint_states" in says and "/effort/commands" in says
+    for name in ("/joint_states/shoulder/position", "/effort/commands/data[0]"):
+        there = np.isfinite(table.columns[name])
+        assert there.sum() == N
+        # The median of the offsets is exact here, to nanoseconds of rounding.
+        expected = position(time[there], 0)
+        np.testing.assert_allclose(table.columns[name][there], expected, atol=1e-6)

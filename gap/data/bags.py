@@ -18,6 +18,9 @@ BAGS = (".bag", ".mcap", ".db3")
 LONGEST_ARRAY = 64  # Longer ones are pictures, maps, clouds.
 _JOINT_STATE = "sensor_msgs/msg/JointState"
 _TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
+# [s] Topics whose stamps differ from the bag's by more than this, or by one another's
+# offsets, are on clocks of their own.
+CLOCKS_APART = 1.0
 
 
 def is_bag(path: Path) -> bool:
@@ -28,8 +31,11 @@ def is_dataset(path: Path) -> bool:
     return (path / "meta" / "info.json").is_file()
 
 
-def read_bag(path: Path, unused: frozenset[str] = frozenset()) -> dict[str, np.ndarray]:
-    """Columns (n,), `time` [s] from the first stamp on and what the topics hold.
+def read_bag(
+    path: Path, unused: frozenset[str] = frozenset()
+) -> tuple[dict[str, np.ndarray], list[tuple[str, str]]]:
+    """Columns (n,), `time` [s] from the first stamp on and what the topics hold; and
+    (kind, sentence) of what was done about topics with clocks of their own.
 
     Raises: ValueError, one line.
     """
@@ -41,7 +47,8 @@ def read_bag(path: Path, unused: frozenset[str] = frozenset()) -> dict[str, np.n
             f"recording {path}: bags need rosbags: pip install 'makebreak[ros]'"
         ) from None
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
-    stamps: list[int] = []
+    topics: list[str] = []
+    stamps: list[tuple[int, int]] = []  # [ns] Of the header, 0 if none; of the bag.
     rows: list[dict[str, float]] = []
     unread: set[str] = set()
     try:
@@ -56,7 +63,8 @@ def read_bag(path: Path, unused: frozenset[str] = frozenset()) -> dict[str, np.n
                     continue
                 values = dict(_numbers(connection.topic, connection.msgtype, message))
                 if values:
-                    stamps.append(_stamp(message) or received)
+                    topics.append(connection.topic)
+                    stamps.append((_stamp(message), received))
                     rows.append(values)
     except Exception as error:  # The library raises what its formats' readers raise.
         why = " ".join(str(error).split())[:200] or type(error).__name__
@@ -64,9 +72,81 @@ def read_bag(path: Path, unused: frozenset[str] = frozenset()) -> dict[str, np.n
             f"recording {path} is no bag that can be read: {why}"
         ) from None
     if not rows:
-        topics = f"; not read: {', '.join(sorted(unread))}" if unread else ""
-        raise ValueError(f"recording {path} holds no message with numbers{topics}")
-    return _table(np.array(stamps), rows)
+        lost = f"; not read: {', '.join(sorted(unread))}" if unread else ""
+        raise ValueError(f"recording {path} holds no message with numbers{lost}")
+    one_clock, notes = _on_one_clock(path, np.array(topics), np.array(stamps))
+    return _table(one_clock, rows), notes
+
+
+def _on_one_clock(
+    path: Path, topics: np.ndarray, stamps: np.ndarray
+) -> tuple[np.ndarray, list[tuple[str, str]]]:
+    """(n,) [ns] of each message, and what is to be said of it.
+
+    Headers say when something was sampled, the bag when it was written: headers are
+    used where their clocks agree with each other and with the bag's. Else every
+    topic's stamps are brought to one clock by the line between them and the bag's
+    stamps, which each message has: the headers' clock where there is but one (a
+    simulation may run at half speed), or the bag's.
+
+    Args: topics (n,): of each message. stamps (n, 2) [ns]: its header's, 0 where there
+        is none, and the bag's.
+    """
+    header, bag = stamps.T
+    lines: dict[str, tuple[float, float]] = {}  # Offset [ns] and slope of bag's stamps.
+    for topic in dict.fromkeys(topics):
+        own = topics == topic
+        # A clock that was never set, or stands, tells nothing.
+        if (header[own] == 0).any() or len(np.unique(header[own])) < 0.5 * own.sum():
+            header[own] = bag[own]
+            continue
+        lines[topic] = _line(header[own], bag[own])
+    off = np.array([offset for offset, _ in lines.values()])
+    headless = len(lines) < len(set(topics))
+    far = off[np.abs(off) > 1e9 * CLOCKS_APART]
+    if not far.size or not headless and np.ptp(off) < 1e9 * CLOCKS_APART:
+        return header, []
+    out = bag.astype(float) - float(bag[0])
+    one = len(lines) < 2 or np.ptp(off) < 1e9 * CLOCKS_APART
+    first = next(iter(lines))
+    offset, slope = lines[first]
+    for topic in dict.fromkeys(topics):
+        own = topics == topic
+        if topic in lines and one:
+            out[own] = (header[own] - header[topics == first][0]).astype(float)
+        elif topic in lines:
+            a, b = lines[topic]
+            start = header[own][0]
+            out[own] = a + (b * (header[own] - start) + float(start - bag[0]))
+        elif one:
+            start = header[topics == first][0]
+            out[own] = ((bag[own] - start).astype(float) - offset) / slope
+    apart = float(np.abs(off).max()) * 1e-9
+    others = ", ".join(t for t in dict.fromkeys(topics) if t not in lines)
+    says = (
+        f"{path.name}: the stamps of {', '.join(lines)} are {apart:.4g} s from the "
+        "bag's, "
+    )
+    says += (
+        f"which are all that {others} has" if others
+        else "each by another amount"
+    )  # fmt: skip
+    says += ": they have no common clock; the bag's stamps, which every message has, "
+    says += f"bring them to that of {first}" if one else "bring them together"
+    return np.rint(out).astype(np.int64), [("clocks_differ", says)]
+
+
+def _line(header: np.ndarray, bag: np.ndarray) -> tuple[float, float]:
+    """(offset [ns], slope) of bag - header[0] = offset + slope (header - header[0]):
+    through medians of the first and the last third, as few messages come late."""
+    x, y = (header - header[0]).astype(float), (bag - header[0]).astype(float)
+    slope, third = 1.0, len(x) // 3
+    if third > 10:
+        dx, dy = (np.median(z[-third:]) - np.median(z[:third]) for z in (x, y))
+        # Clocks of one rate differ by less than messages are late.
+        if dx > 0.0 and dy > 0.0 and abs(dy / dx - 1.0) > 0.02:
+            slope = float(dy / dx)
+    return float(np.median(y - slope * x)), slope
 
 
 def _stamp(message) -> int:

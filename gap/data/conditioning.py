@@ -116,7 +116,7 @@ def _repeats(recording: Recording, channel: Channel) -> np.ndarray:
         rows = np.flatnonzero(np.isfinite(channel.values[episode.rows]))
         rows = rows + episode.first
         y, t = channel.values[rows], recording.time[rows]
-        same = np.concatenate([[False], np.diff(y) == 0.0])
+        same = np.diff(y, prepend=np.nan) == 0.0
         starts = np.flatnonzero(np.diff(same.astype(int), prepend=0) == 1)
         ends = np.flatnonzero(np.diff(same.astype(int), append=0) == -1) + 1
         for i, j in zip(starts, ends, strict=True):

@@ -66,8 +66,9 @@ def read_recordings(
         )
         for path, name in zip(files, stems, strict=True)
     ]
-    return [replace(recording, time=recording.time - recording.time[0])
+    each = [replace(recording, time=recording.time - recording.time[0])
             for recording in each]  # fmt: skip
+    return where_known(each)
 
 
 def read_recording(
@@ -90,7 +91,7 @@ def read_recording(
     path = Path(path)
     sidecar = read_sidecars(path, sidecar_path)
     bad = BadRows(path, skip_bad_rows)
-    columns, row, n_rows = _read_columns(path, sidecar, most_cells, bad)
+    columns, row, n_rows, done = _read_columns(path, sidecar, most_cells, bad)
     is_excerpt = len(row) + bad.count + bad.twice < n_rows
     number = columns.get("episode")
     try:
@@ -109,7 +110,7 @@ def read_recording(
     episodes, notes = broken_at_holes(path, episodes, time)
     spans = sidecar.get("ignore") or []
     episodes, more = without_ignored(path, episodes, time, spans)
-    notes += more + _without_empty(path, columns)
+    notes = [*done, *notes, *more, *_without_empty(path, columns)]
     _check_sizes(path, columns, row)
     flips, norm_errors = mend_quaternions(path, columns, episodes, row)
     if is_excerpt:
@@ -133,11 +134,61 @@ def read_recording(
     )
 
 
+def where_known(recordings: Sequence[Recording]) -> list[Recording]:
+    """The recordings without episodes in which a joint that was measured, or driven, in
+    others has no sample of its position, or of what drove it; it is said. Commands
+    are what drives a joint, or a measured effort where there is none.
+
+    Raises: ValueError where nothing is left.
+    """
+    needed: dict[str, None] = {}
+    for name in dict.fromkeys(name for r in recordings for name in r.channels):
+        at, _, quantity = name.rpartition(".")
+        if quantity in (*COMMANDS, "position"):
+            needed[name] = None
+        elif quantity == "effort_measured" and not any(
+            f"{at}.{command}" in r for r in recordings for command in COMMANDS
+        ):
+            needed[name] = None
+    out, said = [], list[tuple[str, str]]()
+    for r in recordings:
+        kept = []
+        for e in r.episodes:
+            lost = [n for n in needed if not _has(r, n, e)]
+            if not lost:
+                kept.append(e)
+                continue
+            is_whole = not any(_has(r, lost[0], other) for other in r.episodes)
+            which = "" if is_whole else f", episode {e.number},"
+            says = f"{r.path.name}{which} has no sample of {', '.join(lost)}, which "
+            said.append(("channel_missing", says + "others have: it is left out"))
+        if kept:
+            out.append(replace(r, episodes=tuple(kept)))
+    if not out:
+        raise ValueError(f"no episode has samples of all of {', '.join(needed)}")
+    for r in out:
+        for name in dict.fromkeys(n for other in out for n in other.channels):
+            none = [e.number for e in r.episodes if not _has(r, name, e)]
+            if none and any(_has(o, name, e) for o in out for e in o.episodes):
+                where = r.path.name
+                if len(r.episodes) > 1:
+                    where += f", episode {', '.join(map(str, none[:5]))},"
+                says = f"{where} has no sample of {name}, which others have: it is used"
+                said.append(("channel_missing", f"{says} without"))
+    first = replace(out[0], notes=(*out[0].notes, *dict.fromkeys(said)))
+    return [first, *out[1:]]
+
+
+def _has(recording: Recording, name: str, episode: Episode) -> bool:
+    """Whether a channel has any sample in an episode."""
+    return name in recording and bool(np.isfinite(recording[name][episode.rows]).any())
+
+
 def _read_columns(
     path: Path, sidecar: Mapping, most_cells: int, bad: BadRows
-) -> tuple[dict[str, np.ndarray], np.ndarray, int]:
-    """Columns under our names, (n,) numbers of their rows in the file, and how many
-    rows that has; time is there and in seconds."""
+) -> tuple[dict[str, np.ndarray], np.ndarray, int, Sequence[tuple[str, str]]]:
+    """Columns under our names, (n,) numbers of their rows in the file, how many rows
+    that has, and notes of what was done; time is there and in seconds."""
     names = sidecar.get("columns") or {}
     unused = frozenset(str(name) for name, to in names.items() if to is None)
     table = read_table(path, most_cells, bad, unused)
@@ -151,7 +202,7 @@ def _read_columns(
     _check_time(path, columns)
     columns, row = _without_twice(columns, table.row, bad)
     columns, row = _without_bad_rows(columns, row, bad)
-    return columns, row, table.n_rows
+    return columns, row, table.n_rows, table.notes
 
 
 def _check_time(path: Path, columns: Mapping[str, np.ndarray]) -> None:

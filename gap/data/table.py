@@ -57,12 +57,14 @@ class RecordingTable:
     """A table as it was read.
 
     columns: {name: (n,) float}. row: (n,) number of each row in the file, from 1; it
-    jumps where rows were left out. n_rows: rows of the file.
+    jumps where rows were left out. n_rows: rows of the file. notes: (kind, sentence)
+    of what was done in reading.
     """
 
     columns: dict[str, np.ndarray]
     row: np.ndarray
     n_rows: int
+    notes: tuple[tuple[str, str], ...] = ()
 
 
 def is_channel(name: str) -> bool:
@@ -194,12 +196,12 @@ def read_table(
     if not path.exists():
         raise ValueError(f"recording {path} does not exist")
     if is_bag(path) or is_dataset(path):
-        columns = (
+        columns, notes = (
             read_bag(path, unused) if is_bag(path)
-            else read_dataset(path, _parquet_columns, unused)
+            else (read_dataset(path, _parquet_columns, unused), [])
         )  # fmt: skip
         n = len(next(iter(columns.values())))
-        table = RecordingTable(columns, np.arange(n) + 1, n)
+        table = RecordingTable(columns, np.arange(n) + 1, n, tuple(notes))
     else:
         table = _read_file(path, most_cells, bad, unused)
     if not table.row.size:
