@@ -542,9 +542,12 @@ class MechanismProblem(InverseModel, GapProblem):
     def judged(self) -> dict[str, str]:
         how = {}
         for i, joint in enumerate(self.joints):
-            how[f"{joint}.position"] = "equations and simulation"
+            by = "equations and simulation"
+            if self.untold[i]:  # It is given in simulation.
+                by = "not"
+            how[f"{joint}.position"] = by
             if self.has["velocity"][i]:
-                how[f"{joint}.velocity"] = "equations and simulation"
+                how[f"{joint}.velocity"] = by
             if self.has["effort_measured"][i]:
                 how[f"{joint}.effort_measured"] = "equations"
         return how

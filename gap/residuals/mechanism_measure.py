@@ -117,7 +117,8 @@ def _equations(
     block = motion.blocks().reshape(-1, n)[rows, 0]
     squares = [motion.in_noise(r).reshape(-1, n)[rows] ** 2 for r in both]
     for k, (what, joint) in enumerate(motion.names()):
-        if what != "effort" or not len(block):
+        untold = motion.untold[motion.joints.index(joint)]
+        if what != "effort" or untold or not len(block):
             continue
         name = f"{joint}.effort"
         units[name] = InUnits(

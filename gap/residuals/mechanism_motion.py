@@ -141,6 +141,16 @@ class MechanismMotion:
                 self.has["effort_measured"], self.commanded, strict=True
             )
         ]
+        # What drives a joint that has a drive is not zero where no column says it.
+        self.untold = np.array(
+            [
+                joint in scene.actuation.joints and not (commanded or measured)
+                for joint, commanded, measured in zip(
+                    self.joints, self.commanded, self.has["effort_measured"],
+                    strict=True,
+                )
+            ]
+        )  # fmt: skip
         # What turns the rotor is in no torque that is measured at the link.
         self._link_rotor = np.array(
             [rotor_before(scene, self.dynamics.plant, joint) for joint in self.joints]

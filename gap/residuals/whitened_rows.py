@@ -124,6 +124,9 @@ class WhitenedRows(MechanismMotion):
         out = []
         for noise in self._noises:
             C = noise["effort"] + np.diag(error["effort"] ** 2)
+            # An equation whose effort is not told says nothing, of others neither.
+            C[:, self.untold] = C[:, :, self.untold] = 0.0
+            C[:, self.untold, self.untold] = 1.0
             each = {"effort": np.linalg.inv(np.linalg.cholesky(C))}
             for what in OTHERS:
                 each[what] = np.hypot(noise[what], error[what])
@@ -223,6 +226,9 @@ class WhitenedRows(MechanismMotion):
     def _stacked(self, track, white, efforts, others) -> np.ndarray:
         """Rows of one track: bump by bump, efforts of all joints, then the others."""
         shape = efforts.shape[2:]
+        if self.untold.any():
+            efforts = np.array(efforts)
+            efforts[:, self.untold] = 0.0
         e = np.einsum("bij,bj...->bi...", white["effort"], efforts)
         parts = [e]
         for what in OTHERS:

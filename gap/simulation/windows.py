@@ -166,6 +166,7 @@ class WindowModel(WindowedResidual):
             for i in sorted(plant.GetFloatingBaseBodies())
             if all(f"{full_name(plant, plant.get_body(i))}.x" in r for r in recordings)
         ]
+        self._untold = untold_joints(scene, recordings)
         known = set(self.simulation.channels())
         self.channels = [
             name
@@ -175,6 +176,7 @@ class WindowModel(WindowedResidual):
             and not recordings[0].channels[name].is_command
             and not name.endswith(".effort_measured")
             and name.rsplit(".", 1)[0] in (*self.joints, *self.bodies)
+            and name.rsplit(".", 1)[0] not in self._untold
         ]
         if not self.channels:
             raise DoesNotFit(
@@ -342,7 +344,7 @@ class WindowModel(WindowedResidual):
             joint: given_late(effects, f"{joint}.effort_measured")
             for joint in self._driven("effort_command")
         }
-        key = tuple(late.values())
+        key = (*late.values(), *(e.key for e in effects if self._untold))
         if key in self._commands:
             return self._commands[key]
         out = []
@@ -356,6 +358,8 @@ class WindowModel(WindowedResidual):
                     time, columns = self._given(recording, episode, i, late)
                 else:
                     time = time + self.commands_late
+                if self._untold:
+                    columns |= self._needed(episode, i, effects, time)
                 of[episode.first] = Commands(time, columns)
             out.append(of)
         self._commands[key] = out
@@ -390,6 +394,35 @@ class WindowModel(WindowedResidual):
                 y = y + rotor * rate
             columns[f"{joint}.effort_command"] = y
         return time, columns
+
+    def _needed(self, episode: Episode, i: int, effects, time) -> dict[str, np.ndarray]:
+        """{effort_command: (n,) [N m]} of joints whose efforts are not told: what the
+        scene with these effects needs to move as was measured."""
+        scene = replace(self.scene, effects=list(effects))
+        dynamics = SceneDynamics(scene)
+        plant, path = dynamics.plant, self._paths[i, episode.first]
+        moving = {
+            full_name(plant, j): j.velocity_start()
+            for j in one_dof_joints(plant)
+            if j.num_velocities()
+        }
+        if len(moving) != plant.num_velocities() or not moving.keys() <= set(
+            self.joints
+        ):
+            raise DoesNotFit(
+                f"what drives {', '.join(self._untold)} is not recorded, and not all "
+                "that moves with it is measured"
+            )
+        middle = time + 0.5 * np.diff(time, append=time[-1])
+        motion = np.zeros((3, len(time), len(moving)))
+        for joint, k in moving.items():
+            for of, x in zip(motion, path[f"{joint}.position"].T, strict=True):
+                of[:, k] = np.interp(middle, path["time"], x)
+        effort = dynamics.inverse_dynamics(*motion, middle)
+        return {
+            f"{joint}.effort_command": effort[:, moving[joint]]
+            for joint in self._untold
+        }
 
     def _grown(
         self, recording: Recording, states, spreads, rows: slice, after, jumps
@@ -635,6 +668,19 @@ class WindowModel(WindowedResidual):
             e = (seen_in(self, w) - y) / size if len(y) else y
             out.append(np.where(np.isnan(e), 0.0, e))
         return out
+
+
+def untold_joints(scene: Scene, recordings: Sequence[Recording]) -> list[str]:
+    """Joints that the scene drives by efforts, and of which a recording has neither a
+    command nor a measured effort: what drives them is not known."""
+    if "effort_command" not in COMMANDS_OF[scene.actuation.type]:
+        return []
+    told = ("effort_command", "effort_measured")
+    return [
+        joint
+        for joint in scene.actuation.joints
+        if any(not any(f"{joint}.{what}" in r for what in told) for r in recordings)
+    ]
 
 
 def with_step(scene: Scene, time_step: float) -> Scene:
