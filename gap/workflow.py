@@ -30,6 +30,7 @@ from makebreak.gap.data.check_drives import (
     check_couplings,
     check_drives,
     check_initial_names,
+    check_untold,
 )
 from makebreak.gap.data.check_meshes import check_meshes
 from makebreak.gap.data.checks import check_recordings
@@ -197,6 +198,7 @@ def _run(
     go_on()
     checks += check_recordings(parts.decided, scene_facts(dynamics.plant))
     checks += check_tool_weight(dynamics, parts.decided)
+    checks += check_untold(scene, parts.decided)
     is_mechanism = _is_mechanism(dynamics, recordings)
     # An impact would be smeared by means over rows.
     meets = is_mechanism and any(

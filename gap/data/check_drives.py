@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 from pydrake.multibody.plant import MultibodyPlant
 
+from makebreak.gap.data.findings import Finding
 from makebreak.gap.data.recording import Recording
 from makebreak.models.model_files import couplings_of
 from makebreak.models.scene import ActuationSection, Scene, initial_for
@@ -55,6 +56,37 @@ def check_drives(recording: Recording, scene: Scene) -> None:
         "or leave the columns out: map them to null under `columns` in "
         f"{recording.path.with_suffix('.yaml').name}"
     )
+
+
+def untold_joints(scene: Scene, recordings: Sequence[Recording]) -> list[str]:
+    """Joints that the scene drives by efforts, and of which a recording has neither a
+    command nor a measured effort: what drives them is not known."""
+    if "effort_command" not in COMMANDS_OF[scene.actuation.type]:
+        return []
+    told = ("effort_command", "effort_measured")
+    return [
+        joint
+        for joint in scene.actuation.joints
+        if any(not any(f"{joint}.{what}" in r for what in told) for r in recordings)
+    ]
+
+
+def check_untold(scene: Scene, recordings: Sequence[Recording]) -> list[Finding]:
+    """What is done about joints whose efforts are not recorded."""
+    joints = untold_joints(scene, recordings)
+    if not joints:
+        return []
+    is_one = len(joints) == 1
+    name, it = ("it", "its") if is_one else ("they", "their")
+    says = (
+        f"{', '.join(joints)} {'is' if is_one else 'are'} driven (actuation of the "
+        f"scene), and no column says by what: {it} own equation{'s are' * (not is_one)}"
+        f"{' is' * is_one} left out, and in simulation {name} "
+        f"move{'s' * is_one} as measured. If nothing drives {'it' if is_one else 'them'}"
+        ", take it from the scene's actuation; else record the effort."
+    )
+    return [Finding("untold_effort", recordings[0].name, joints[0], len(joints), "",
+                    "warning", says)]  # fmt: skip
 
 
 def check_couplings(scene: Scene, plant: MultibodyPlant) -> None:

@@ -32,7 +32,12 @@ from makebreak.gap.data.proposal import (
     said_of,
     sidecar_text,
 )
-from makebreak.gap.data.servo_gains import ServoGains, ServoLog, servo_gains
+from makebreak.gap.data.servo_gains import (
+    ServoGains,
+    ServoLog,
+    effort_shares,
+    servo_gains,
+)
 from makebreak.gap.data.sidecar import own_sections
 from makebreak.gap.data.table import (
     RecordingTable,
@@ -58,6 +63,7 @@ SERVO_DAMPING_SEC = 0.07  # Of kd to kp, of a small geared servo's back-EMF.
 ROTOR_SEC = 0.05  # Of its inertia at the joint to kd.
 GAINS_KNOWN_TO = 0.05  # Of those that motion tells; the masses alone are off by 3 %.
 LEAST_ROTOR = 0.05  # Of what a joint moves: less is left out of a proposal.
+DRIVEN_SHARE = 0.5  # Of its weight and motion, the effort that a driven joint needs.
 LEAST_LOAD = 0.05  # Of a joint's rms gravity torque [N m], to tell its servo by.
 
 
@@ -479,6 +485,8 @@ def _actuation(
     for what in ("effort_command", "effort_measured"):
         if joints := named(what):
             notes.append(f"the joints are driven by the recorded {what}")
+            untold = _untold(robot, every, logs, joints)
+            joints = [j.name for j in robot.joints if j.name in (*joints, *untold)]
             return [f"actuation: {{type: effort, joints: [{', '.join(joints)}]}}"], ""
     if joints := named("position_command"):
         gains = _gains_by_motion(robot, every, logs)
@@ -578,8 +586,24 @@ def _scaled(log: Log, matches: Sequence[Match]) -> dict[str, np.ndarray]:
     }
 
 
-def _gains_by_motion(robot: Robot, every, logs) -> dict[str, ServoGains]:
-    """{joint: gains} of position servos, where the logs say them."""
+def _untold(robot: Robot, every, logs, told: Collection[str]) -> list[str]:
+    """Joints without a column of what drives them that do not move as one that nothing
+    drives."""
+    if all(j.name in told for j in robot.joints):
+        return []
+    motions = _motions(robot, every, logs)
+    if robot.plant.num_positions() != len(robot.joints) or not motions:
+        return []
+    shares = effort_shares(robot.plant, motions)
+    return [
+        joint.name
+        for joint, share in zip(robot.joints, shares, strict=True)
+        if joint.name not in told and share > DRIVEN_SHARE
+    ]
+
+
+def _motions(robot: Robot, every, logs) -> list[ServoLog]:
+    """Of each log in which all joints are measured."""
     motions = []
     for log in logs:
         channels = _scaled(log, every[log.path])
@@ -592,6 +616,12 @@ def _gains_by_motion(robot: Robot, every, logs) -> dict[str, ServoGains]:
         good = np.isfinite(q).all(axis=1) & np.isfinite(time)
         good &= np.diff(time, prepend=-np.inf) > 0.0
         motions.append(ServoLog(time[good], q[good], np.stack(told, axis=1)[good]))
+    return motions
+
+
+def _gains_by_motion(robot: Robot, every, logs) -> dict[str, ServoGains]:
+    """{joint: gains} of position servos, where the logs say them."""
+    motions = _motions(robot, every, logs)
     if robot.plant.num_positions() != len(robot.joints) or not motions:
         return {}
     found = servo_gains(robot.plant, motions)

@@ -83,17 +83,10 @@ def _equations(plant: MultibodyPlant, motion: ServoLog):
     that the robot needs (m,), while it moves; all averaged by one kernel."""
     t, n = motion.time, motion.q.shape[1]
     none = (np.zeros((0, 4)), np.zeros(0))
-    step = float(np.median(np.diff(t))) if len(t) > 1 else np.inf
-    width = max(int(round(KERNEL_SEC / step)), LEAST_SAMPLES) | 1
-    even = np.arange(t[0], t[-1], step) if np.isfinite(step) else t[:0]
-    if len(even) < 4 * width:
+    averaged = _averaged(motion)
+    if averaged is None:
         return [none] * n
-    kernels = _bump(width, step)
-    q = np.stack([np.interp(even, t, x) for x in motion.q.T], axis=1)
-    mean, rate, rate2 = (
-        np.stack([np.convolve(x, kernel, "valid") for x in q.T], axis=1)
-        for kernel in kernels
-    )
+    even, step, width, kernels, (mean, rate, rate2) = averaged
     some = slice(None, None, max(len(mean) // MOST_SAMPLES, 1))
     needed = _needed(plant, mean[some], rate[some], rate2[some])
     out = []
@@ -111,6 +104,47 @@ def _equations(plant: MultibodyPlant, motion: ServoLog):
         moves = minimum_filter1d(moves, width)[some]
         out.append((X[some][moves], needed[moves, i]))
     return out
+
+
+def _averaged(motion: ServoLog):
+    """Even times (m,), their step, a kernel's width, the kernels, and the joints' mean
+    positions, rates and accelerations by them; None where a log is too short."""
+    t = motion.time
+    step = float(np.median(np.diff(t))) if len(t) > 1 else np.inf
+    width = max(int(round(KERNEL_SEC / step)), LEAST_SAMPLES) | 1
+    even = np.arange(t[0], t[-1], step) if np.isfinite(step) else t[:0]
+    if len(even) < 4 * width:
+        return None
+    kernels = _bump(width, step)
+    q = np.stack([np.interp(even, t, x) for x in motion.q.T], axis=1)
+    states = [
+        np.stack([np.convolve(x, kernel, "valid") for x in q.T], axis=1)
+        for kernel in kernels
+    ]
+    return even, step, width, kernels, states
+
+
+def effort_shares(plant: MultibodyPlant, motions: Sequence[ServoLog]) -> np.ndarray:
+    """(n,) rms of the effort that each joint needs, over that of its parts, weight and
+    motion: next to 0 where they cancel, as of a joint that nothing drives; about 1 of a
+    driven one. NaN where the logs are too short.
+
+    Args: as of servo_gains.
+    """
+    squares = np.zeros((2, plant.num_positions()))
+    for motion in motions:
+        averaged = _averaged(motion)
+        if averaged is None:
+            continue
+        states = averaged[-1]
+        some = slice(None, None, max(len(states[0]) // MOST_SAMPLES, 1))
+        q, v, vd = (x[some] for x in states)
+        needed = _needed(plant, q, v, vd)
+        weight = _needed(plant, q, np.zeros_like(v), np.zeros_like(vd))
+        squares[0] += np.sum(needed**2, axis=0)
+        squares[1] += np.sum(weight**2 + (needed - weight) ** 2, axis=0)
+    with np.errstate(invalid="ignore"):
+        return np.sqrt(squares[0] / squares[1])
 
 
 def _mean_held(t, command, at, width: float) -> np.ndarray:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from makebreak.gap.data.check_drives import untold_joints
 from makebreak.gap.data.recording import Episode, Recording
 from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.numerics.growth import spread_along
@@ -454,6 +455,10 @@ class WindowModel(WindowedResidual):
             q[:, i], v[:, i], vd[:, i] = states[key][at].T
             start[np.ix_([i, n + i], [i, n + i])] = spreads[key][rows.start, :2, :2]
         white, steady = self._effort_noise(recording, joints, n)
+        for name in self._untold:  # Of a smoothed acceleration, an effort's own.
+            own = self.dynamics.momentum(q[:1], np.eye(n)[joints[name]][None])[0]
+            of = spreads[f"{name}.position"][rows, 2, 2]
+            steady[joints[name]] += own[joints[name]] ** 2 * float(np.mean(of))
         impulses = np.zeros((len(after), n))
         for name, variance in jumps.items():
             impulses[:, joints[name]] = variance[rows]
@@ -668,19 +673,6 @@ class WindowModel(WindowedResidual):
             e = (seen_in(self, w) - y) / size if len(y) else y
             out.append(np.where(np.isnan(e), 0.0, e))
         return out
-
-
-def untold_joints(scene: Scene, recordings: Sequence[Recording]) -> list[str]:
-    """Joints that the scene drives by efforts, and of which a recording has neither a
-    command nor a measured effort: what drives them is not known."""
-    if "effort_command" not in COMMANDS_OF[scene.actuation.type]:
-        return []
-    told = ("effort_command", "effort_measured")
-    return [
-        joint
-        for joint in scene.actuation.joints
-        if any(not any(f"{joint}.{what}" in r for what in told) for r in recordings)
-    ]
 
 
 def with_step(scene: Scene, time_step: float) -> Scene:
