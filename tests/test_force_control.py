@@ -238,10 +238,34 @@ def test_an_arm_with_friction_that_the_model_has_tracks_as_one_without(plant, wo
     serial_chain = serial_chain_of(plant, "tip")
     without, known = worst(plant, []), worst(own, world, laws)
     unknown = worst(plant, world)
-    # The velocity is a tick old: 8 N m s/rad at 10 rad/s2 are 0.08 N m, some 0.2 N of
-    # 600 N/m at the tip. Not known, the friction moves it by centimetres.
+    # The joints differ from the reference's velocity by what the posture turns: some
+    # 0.01 rad/s, 0.1 N m, at the tip 0.2 N of 600 N/m. Friction that is not known moves
+    # it by centimetres.
     assert known < without + 0.4e-3
     assert unknown > 0.01
+
+
+@pytest.mark.parametrize("kind", ["viscous_damping", "coulomb_friction"])
+def test_friction_that_only_the_model_has_drives_nothing_at_rest(plant, kind):
+    """Fed back, it would be negative damping and shake the wrist at 1 rad/s."""
+    model = read_scene(TABLETOP_WALLS)
+    set_tool(model, "sphere")
+    name = kind.split("_")[1 if "damping" in kind else 0]
+    model.effects = [Effect(f"joint_{kind}", ["panda"], {name: 8.0})]
+    own = make_control_plant(model, TOOL)
+    loop = Loop(own, laws=control_laws(model, own, TOOL))
+    for k in range(2000):
+        t = 1e-3 * k
+        d = [0.05 * np.sin(3.0 * t) ** 2, 0.15 * np.sin(6.0 * t)]
+        a = 0.9 * np.cos(6.0 * t)
+        loop.set(x_desired=reference(START + [0, d[0], 0], [0, d[1], 0], [0, a, 0]))
+        loop.run(0.001)
+    loop.set(x_desired=reference())
+    loop.run(10.0)  # The posture returns slowly: a factor of ten in 2 s.
+    state = loop.station.GetOutputPort("state").Eval(loop.station_context)
+    assert np.abs(state[7:]).max() < 1e-3
+    at = chain_state(serial_chain_of(plant, "tip"), state[:7], state[7:]).p_WE
+    np.testing.assert_allclose(at, START, atol=1e-4)
 
 
 def test_without_a_sensor_the_force_is_fed_forward(plant):

@@ -16,7 +16,7 @@ from makebreak.systems.arm.numerics.impedance_controller import (
     packed_tick,
     warm_up,
 )
-from makebreak.systems.arm.numerics.joint_friction import to_compensate
+from makebreak.systems.arm.numerics.joint_friction import NO_LAWS
 from makebreak.systems.arm.numerics.packed import packed
 from makebreak.systems.arm.numerics.serial_chain import SerialChain, chain_state
 from makebreak.systems.numerics.first_calls import first_call
@@ -27,7 +27,6 @@ from makebreak.systems.numerics.timing import timed
 # Largest damping over (mass of the tip / delay). Damping alone is unstable above pi/2;
 # a third of that leaves a margin for the spring.
 DELAY_DAMPING_MAX = 0.5
-NO_LAWS = JointLaws(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 4)))
 
 
 @dataclass
@@ -91,9 +90,9 @@ class ImpedanceController(LeafSystem):
     With `control_orientation` False the task is the tip's position; the posture keeps
     the tool's orientation as at the control plant's default positions. With True the
     task is the full pose.
-    tau is the motors' torque: the mass matrix contains the rotors' inertia, and bias
-    the plant's joint damping. Dry friction and other forces in the joints are
-    compensated by `laws` (numerics/joint_friction.py).
+    tau is the motors' torque: the mass matrix contains the rotors' inertia. The plant's
+    joint damping and the forces in the joints of `laws` are compensated by the
+    reference's velocity (numerics/joint_friction.py).
 
     A variable stiffness rises only as far as an energy tank can pay for it
     (numerics/energy_tank.py); its level is in the Context.
@@ -203,7 +202,7 @@ class ImpedanceController(LeafSystem):
                 release_sec=float(hybrid.release_sec),
                 speed_keep=float(np.exp(-config.period_sec / SPEED_FILTER_SEC)),
             ),
-            laws=to_compensate(laws or NO_LAWS),
+            laws=laws if laws is not None and len(laws.kind) else NO_LAWS,
         )
         self._ratio = float(hybrid.damping_ratio)
         self._packed = packed(self._chain), packed(self._law)

@@ -7,7 +7,7 @@
 
 with none, one or two directions n along which force instead of motion is controlled. M
 is the mass matrix with the motors' rotors, so tau is the motors' torque; tau_joint is
-against dry friction and other forces in the joints (joint_friction.py); Lambda is the
+against friction and other forces in the joints (joint_friction.py); Lambda is the
 inverse of J inv(M) J'. Stiffness K [N/m] and damping D [N s/m] are not scaled by
 Lambda, which multiplies only the reference's acceleration. The posture q_n follows the
 tip with the tool upright, at the joint velocity v_n.
@@ -394,8 +394,9 @@ def impedance_torque(
     if n <= m and part < SINGULAR:
         inertial *= (part / SINGULAR) ** 2
     tau = J.T @ (F + inertial) + s.bias + s.M @ qdd
-    if np.any(law.laws.p[:, :2] != 0.0):
-        tau += joint_torque(law.laws, q, v, _damped_inverse(s.J, moves))
+    if np.any(law.laws.p[:, :2] != 0.0) or np.any(chain.damping != 0.0):
+        tau -= chain.damping * v  # Of the bias: not fed back.
+        tau += joint_torque(law.laws, chain.damping, q, _damped_inverse(s.J, moves))
     return tau, s.p_WE
 
 
@@ -522,7 +523,7 @@ def tick(
             memory[:n] = posture_step(chain, law, memory[:n].copy(), p_tip)
     else:  # Carry the arm and slow it down: qdd = -HOLD_DAMPING v.
         now = chain_state(chain, q_now, v_now)
-        asked = now.bias - HOLD_DAMPING * (now.M @ v_now)
+        asked = now.bias - chain.damping * v_now - HOLD_DAMPING * (now.M @ v_now)
     if not np.all(np.isfinite(asked)):  # Overflow.
         asked = chain_state(chain, q_now, np.zeros(n)).bias
         status |= REFERENCE_HELD
