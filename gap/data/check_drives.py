@@ -76,14 +76,15 @@ def check_untold(scene: Scene, recordings: Sequence[Recording]) -> list[Finding]
     joints = untold_joints(scene, recordings)
     if not joints:
         return []
-    is_one = len(joints) == 1
-    name, it = ("it", "its") if is_one else ("they", "their")
+    own, it = "their own equations are", "they move"
+    are = "are"
+    if len(joints) == 1:
+        own, it, are = "its own equation is", "it moves", "is"
     says = (
-        f"{', '.join(joints)} {'is' if is_one else 'are'} driven (actuation of the "
-        f"scene), and no column says by what: {it} own equation{'s are' * (not is_one)}"
-        f"{' is' * is_one} left out, and in simulation {name} "
-        f"move{'s' * is_one} as measured. If nothing drives {'it' if is_one else 'them'}"
-        ", take it from the scene's actuation; else record the effort."
+        f"{', '.join(joints)} {are} driven (actuation of the scene), and no column says "
+        f"by what: {own} left out, and in simulation {it} as measured. If nothing "
+        f"drives {'it' if are == 'is' else 'them'}, change the scene's actuation; else "
+        "record the effort."
     )
     return [Finding("untold_effort", recordings[0].name, joints[0], len(joints), "",
                     "warning", says)]  # fmt: skip

@@ -210,7 +210,7 @@ class WindowModel(WindowedResidual):
             raise DoesNotFit(
                 f"no episode of the recordings holds a window of {window_sec} s"
             )
-        self._commands: dict[tuple[float, ...], list[dict[int, Commands]]] = {}
+        self._commands: dict[tuple, list[dict[int, Commands]]] = {}
         self.runs = 0
 
     def set_commands_late(self, seconds: float) -> None:
@@ -419,7 +419,8 @@ class WindowModel(WindowedResidual):
         for joint, k in moving.items():
             for of, x in zip(motion, path[f"{joint}.position"].T, strict=True):
                 of[:, k] = np.interp(middle, path["time"], x)
-        effort = dynamics.inverse_dynamics(*motion, middle)
+        q, v, vd = motion
+        effort = dynamics.inverse_dynamics(q, v, vd, middle)
         return {
             f"{joint}.effort_command": effort[:, moving[joint]]
             for joint in self._untold
