@@ -81,10 +81,10 @@ def check_untold(scene: Scene, recordings: Sequence[Recording]) -> list[Finding]
     if len(joints) == 1:
         own, it, are = "its own equation is", "it moves", "is"
     says = (
-        f"{', '.join(joints)} {are} driven (actuation of the scene), and no column says "
-        f"by what: {own} left out, and in simulation {it} as measured. If nothing "
-        f"drives {'it' if are == 'is' else 'them'}, change the scene's actuation; else "
-        "record the effort."
+        f"{', '.join(joints)} {are} driven (actuation of the scene), and no column "
+        f"says by what: {own} left out, and in simulation {it} as measured. If nothing "
+        f"drives {'it' if are == 'is' else 'them'}, change the scene's actuation; "
+        "else record the effort."
     )
     return [Finding("untold_effort", recordings[0].name, joints[0], len(joints), "",
                     "warning", says)]  # fmt: skip
