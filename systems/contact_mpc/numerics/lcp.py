@@ -80,11 +80,11 @@ def solve_lcp_kernel(F, q):
                 return lam, NOT_PRECISE
     if worst == 0.0:
         return lam, SOLVED
-    # The same LCP in units in which F has a diagonal of ones and the most negative q is
-    # -1, so that the tolerances below mean the same for grams and for tonnes.
+    # The same LCP in units in which F has a diagonal of ones and the largest |q| is 1,
+    # so that the tolerances below mean the same for grams and for tonnes.
     scale, largest = _units(F), 0.0
     for i in range(n):
-        largest = max(largest, -scale[i] * q[i])
+        largest = max(largest, scale[i] * abs(q[i]))
     M, b = np.empty((n, n)), np.empty(n)
     for i in range(n):
         b[i] = scale[i] * q[i] / largest
