@@ -50,7 +50,7 @@ def inspect_table(log: Log, robot: Robot | None) -> tuple[Table, list[Match]]:
     heads = ("column", "samples", "rate [Hz]", "longest hole [s]", "min", "max",
              "repeated", "proposed channel", "reason")  # fmt: skip
     title = f"{log.path}: {log.table.n_rows} rows"
-    notes = []
+    notes = [says for _, says in log.table.notes]
     if t is not None and np.isfinite(t).any():
         title += f", {np.nanmax(t) - np.nanmin(t):.4g} s"
     else:
