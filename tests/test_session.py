@@ -7,6 +7,7 @@ import re
 import signal
 from dataclasses import dataclass, field
 from pathlib import Path
+from time import sleep
 
 import numba
 import numpy as np
@@ -117,8 +118,8 @@ def test_updates_that_take_longer_than_their_period_are_said(tmp_path):
     own = session(tmp_path)
     own.simulate(builder.Build(), 0.5, {})
     assert own.too_slow() == [
-        "Too slow for real time: slow, 5 of 100 updates took longer than its period of "
-        "5 ms (99 %: 6)"
+        "Too slow for real time: slow, 5 of 100 updates took more CPU time than its "
+        "period of 5 ms (99 %: 6)"
     ]
     own.finish()
     systems = json.loads((own.out_dir / "timing.json").read_text())["systems"]
@@ -130,12 +131,38 @@ class Timed(LeafSystem):
 
     def __init__(self, late):
         super().__init__()
-        self.compute_sec, self._late = [], late
+        self.compute_sec, self.compute_cpu_sec, self._late = [], [], late
         self.DeclarePeriodicDiscreteUpdateEvent(0.005, 0.0, self._update)
 
     def _update(self, context, discrete_state):
         is_late = (len(self.compute_sec) + 1) % self._late == 0
         self.compute_sec.append(0.006 if is_late else 0.004)
+        self.compute_cpu_sec.append(self.compute_sec[-1])
+
+
+class Waiting(LeafSystem):
+    """Waits 3 ms in each update, of 500 a second."""
+
+    def __init__(self):
+        super().__init__()
+        self.DeclarePeriodicDiscreteUpdateEvent(0.002, 0.0, self._update)
+
+    @timed
+    def _update(self, context, discrete_state):
+        sleep(0.003)
+
+
+def test_a_system_that_others_keep_waiting_is_not_called_too_slow(tmp_path):
+    builder = DiagramBuilder()
+    builder.AddNamedSystem("waiting", Waiting())
+    own = session(tmp_path)
+    own.simulate(builder.Build(), 0.1, {})
+    own.finish()
+    timing = json.loads((own.out_dir / "timing.json").read_text())
+    waiting = timing["systems"]["waiting"]
+    assert waiting["p50_ms"] >= 3.0 and waiting["overruns"] == waiting["updates"]
+    assert waiting["cpu_p99_ms"] < 2.0
+    assert own.too_slow() == []
 
 
 class Ticker(LeafSystem):

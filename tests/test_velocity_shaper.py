@@ -644,3 +644,46 @@ def test_bad_numbers_are_refused_by_name(config, message):
         VelocityShaper(config, LINE)
     with pytest.raises(ValueError, match="plan_sec is 0"):
         VelocityShaper(VelocityShaperConfig(), LINE, 0.0)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_pauses_and_contacts_that_move_keep_the_acceleration_within_its_limit(seed):
+    """Steps of the speed that begin while others run add up."""
+    rng = np.random.default_rng(seed)
+    line = Segment("line", [[0, 0, 0.5], [0, 0, 0.0]], (0, 3.0))
+    slide = Segment("line", [[0, 0, 0], [0.1, 0, 0]], (3.0, 5.0),
+                    force_directions=[DOWN], force_targets=[5])  # fmt: skip
+    begins = np.sort(rng.uniform(0.1, 2.5, 3))
+    heights, speeds = rng.uniform(0.1, 0.4, 4), rng.uniform(0.01, 0.1, 4)
+
+    def feel(t, f, rows):
+        f[STATUS] = float(((begins <= t) & (t < begins + 0.05)).any())
+        return f
+
+    def change(t, belief):
+        k = int(np.sum(t > begins - 0.04))
+        at = [0, 0, heights[k]]
+        return ContactBelief((contact(at, DOWN, 0, sigma=0.005, speed=speeds[k]),))
+
+    first = ContactBelief((contact([0, 0, heights[0]], DOWN, 0, sigma=0.005,
+                                   speed=speeds[0]),))  # fmt: skip
+    log = follow(MotionPattern((line, slide)), first, seconds=4.0, feel=feel,
+                 change=change)  # fmt: skip
+    along = np.abs(log.a[log.segment == 0][:, 2])
+    assert along.max() <= 1.01 * LAW.acceleration_max
+    assert along.max() > 0.5 * LAW.acceleration_max
+
+
+def test_a_corner_that_is_too_sharp_for_its_speed_is_refused_and_learned_slowly():
+    turn = np.deg2rad(160)
+    corner = [[0.3, 0, 0.3], [0.5, 0, 0.3],
+              [0.5 + 0.2 * np.cos(turn), 0.2 * np.sin(turn), 0.3]]  # fmt: skip
+    with pytest.raises(ValueError, match="segment 0: a bend of radius .* more time"):
+        MotionPattern((Segment("spline", corner, (0, 4.0)),))
+    slow = MotionPattern((Segment("spline", corner, (0, 20.0)),))
+    speed, bend = slow.speed(0), slow.largest_curvature(0)
+    s = np.linspace(0.0, slow.length(0), 2000)
+    tangents = np.array([slow.geometry(0, x)[1] for x in s])
+    turned = np.linalg.norm(np.gradient(tangents, s, axis=0), axis=1).max()
+    np.testing.assert_allclose(bend, turned, rtol=0.02)  # By central differences.
+    assert speed**2 * bend <= slow.acceleration_max

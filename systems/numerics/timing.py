@@ -7,30 +7,33 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import wraps
-from time import perf_counter
+from time import perf_counter, thread_time
 
 _observers: list[Callable] = []
 
 
 def timed(update):
     """Decorates an update callback: each call's duration [s] is appended to the
-    system's `compute_sec`.
+    system's `compute_sec`, and the CPU time of its thread [s] to `compute_cpu_sec`,
+    which other processes do not lengthen.
 
-    It is an attribute of the system, not in the Context: it describes the computer, and
-    nothing in the simulation may read it.
+    They are attributes of the system, not in the Context: they describe the computer,
+    and nothing in the simulation may read them.
     """
 
     @wraps(update)
     def wrapper(self, context, *args):
         for observer in _observers:
             observer(self, context)
-        start = perf_counter()
+        start, cpu = perf_counter(), thread_time()
         try:
             return update(self, context, *args)
         finally:
             if not hasattr(self, "compute_sec"):
                 self.compute_sec = deque(maxlen=1_000_000)
+                self.compute_cpu_sec = deque(maxlen=1_000_000)
             self.compute_sec.append(perf_counter() - start)
+            self.compute_cpu_sec.append(thread_time() - cpu)
 
     return wrapper
 

@@ -54,6 +54,7 @@ from makebreak.systems.changing_contact.numerics.velocity_profile import (
 KINDS = ("line", "arc", "spline")
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)  # Tool down: then frame tip's axes are the world's.
 _POSITION_TOL, _ANGLE_TOL = 1e-6, 1e-6  # [m], [rad]: rounding of a file's digits.
+_LOOKED_AT = 513  # Points of a path among which it bends most.
 _TURN_MAX = np.deg2rad(170.0)  # Of any orientation from the first: rotation vectors.
 
 
@@ -150,7 +151,7 @@ class MotionPattern:
         base, quaternion wxyz from which rotation vectors are taken, None: the first
         orientation (it matters only where two patterns are to be blended).
     Raises: ValueError that names the segment: times that are not in order, a gap to the
-        one before, too little time for its length.
+        one before, too little time for its length, or for its bends.
     """
 
     segments: tuple[Segment, ...]
@@ -212,6 +213,13 @@ class MotionPattern:
             except ValueError as error:
                 raise ValueError(f"segment {k}: {error}") from None
             table[head + SPEED] = speed
+            bend = _largest_curvature(table, k)
+            if bend * speed**2 > a * (1.0 + 1e-9):
+                raise ValueError(
+                    f"segment {k}: a bend of radius {1.0 / bend:.3g} m at {speed:.3g} "
+                    f"m/s takes {bend * speed**2:.3g} m/s2, expected at most "
+                    f"acceleration_max, {a:.4g}: more time, or a rounder corner"
+                )
             before = speed if table[head + GOES_ON] else 0.0
         table.setflags(write=False)
         base = base.copy()
@@ -238,6 +246,10 @@ class MotionPattern:
     def speed(self, k: int) -> float:
         """Speed of segment k between its two ends [m/s]."""
         return self._head(k, SPEED)
+
+    def largest_curvature(self, k: int) -> float:
+        """Of segment k [1/m]; 0 of a line."""
+        return _largest_curvature(self.table, k)
 
     def ends_in_contact(self, k: int) -> bool:
         """Whether the next segment has a force direction that segment k lacks."""
@@ -322,6 +334,15 @@ def _geometry(kind, X):
     if kind == "arc":
         return arc_data(X[0, :3], X[1, :3], X[2, :3], X[0, 3:], X[2, 3:])
     return spline_data(X)
+
+
+def _largest_curvature(table, k: int) -> float:
+    """Of segment k of a pattern's table [1/m], among _LOOKED_AT of its points."""
+    head = 1 + k * HEAD
+    if KINDS[int(table[head])] == "line":
+        return 0.0
+    points = np.linspace(0.0, float(table[head + LENGTH]), _LOOKED_AT)
+    return max(float(np.linalg.norm(path_point(table, k, s)[2, :3])) for s in points)
 
 
 def _has(directions, n) -> bool:

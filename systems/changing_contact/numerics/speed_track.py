@@ -4,7 +4,8 @@
 
 with S of equation 11, so the speed is smooth in all orders whatever steps begin while
 others run, and s is known in closed form. A step that begins later never ends earlier,
-which keeps the speed from turning negative.
+which keeps the speed from turning negative, and takes longer than 2 |dv| / a_max where
+the sum of all steps would have an acceleration above a_max else.
 
 A track is a record of float64 alone, TRACK, so that it can be part of a vector in a
 Context. Functions change it in place. `law` is a ShaperLaw (shaper_memory.py).
@@ -20,6 +21,9 @@ from makebreak.systems.changing_contact.numerics.velocity_profile import (
     unit_step_integral,
 )
 
+LOOKED_AT = 64  # Instants of a step at which the acceleration of all is looked at,
+LONGER, LONGEST = 1.05, 100.0  # which makes it so many times as long, at most.
+SLACK = 1.005  # Of acceleration_max, which two steps together may reach.
 STEP_SEC_MIN = 0.05  # Of a change of speed, however small: bounds the jerk.
 N_STEPS = 12  # At once, at most.
 
@@ -90,6 +94,29 @@ def step_duration(law, dv):
 
 
 @numba.njit(cache=True)
+def duration_beside(track, law, t, dv):
+    """How long a change of speed by dv [m/s] that begins at time t [s] takes beside the
+    steps that run [s]: it ends no earlier than they do, and all of them together stay
+    within acceleration_max, to 1 %. (They do without it; the longer it is, the less it
+    adds.)
+    """
+    T = max(step_duration(law, dv), steady_from(track, t) - t)
+    if track.n_steps == 0.0:
+        return T
+    longest = LONGEST * T
+    while T < longest:
+        most = 0.0
+        for i in range(1, LOOKED_AT):
+            tau = i / LOOKED_AT
+            a = motion_at(track, t + tau * T)[2] + dv / T * unit_step(tau)[1]
+            most = max(most, abs(a))
+        if most <= SLACK * law.acceleration_max:
+            break
+        T *= LONGER
+    return T
+
+
+@numba.njit(cache=True)
 def begin_step(track, law, t, target):
     """Adds a step to the speed `target` [m/s] that begins at time t [s] and ends no
     earlier than those that run; adds none if N_STEPS run already."""
@@ -99,7 +126,7 @@ def begin_step(track, law, t, target):
         return
     step = track.steps[n]
     step.start, step.change = t, dv
-    step.duration = max(step_duration(law, dv), steady_from(track, t) - t)
+    step.duration = duration_beside(track, law, t, dv)
     track.n_steps += 1.0
     track.target = target
 
@@ -119,7 +146,7 @@ def time_to_brake(track, law, t, s_limit, v_limit):
     if not v > v_limit:
         return np.inf
     steady = steady_from(track, t)
-    T = max(step_duration(law, v - v_limit), steady - t)
+    T = duration_beside(track, law, t, v_limit - v)
     # Where it would be slow if it began now: after `steady` the speed is v.
     s_end = motion_at(track, steady)[0] + v * (t + T - steady) - 0.5 * (v - v_limit) * T
     wait = (s_limit - s_end) / v
