@@ -16,6 +16,7 @@ from pydrake.systems.framework import DiagramBuilder
 from scipy.optimize import linprog, minimize
 from scipy.spatial.transform import Rotation
 
+from makebreak import model_path
 from makebreak.scripts.bench_c3 import (
     OsqpC3,
     ball,
@@ -230,7 +231,9 @@ def test_bounded_qp_step_agrees_with_clarabel_and_sees_infeasibility():
         if within(x, v, lower, upper):
             continue
         sides = np.zeros(h.shape, np.int64)
-        solved = solve_bounded(fac, T[None], T_N, h, x0, v0, lower, upper, sides, x, v)
+        status = solve_bounded(fac, T[None], T_N, h, x0, v0, lower, upper, sides, x, v)
+        solved = status == MET
+        assert status in (MET, CANNOT_BE_MET)
         expected = clarabel(qp)
         assert solved == (expected is not None)
         if not solved:
@@ -1573,3 +1576,40 @@ def test_the_system_holds_the_modes_of_its_last_plan():
     np.testing.assert_allclose(read(simulator, "plan").u, expected.u, atol=1e-12)
     with pytest.raises(ValueError, match="fixed_knots is 6, expected an .* N = 5"):
         C3Mpc(C3Config(weights, options=p.options, fixed_knots=6), 0.05)
+
+
+def test_a_bound_is_not_met_by_pulling():
+    """A finger pushes the puck and does not pull: a bound that asks for that has no
+    plan."""
+    builder = DiagramBuilder()
+    plant, _ = AddMultibodyPlantSceneGraph(builder, 0.0)
+    Parser(plant).AddModels(model_path("puck.sdf"))
+    plant.Finalize()
+    pair = ContactPair("finger", "puck", 0.3)
+    model = AnitescuLcs(builder.Build(), [pair], dt_sec=0.05)
+    lcs = model.build(model.x_default, np.zeros(model.n_u))
+    goal = np.tile([0.4, 0.5, 0.0, 0.0], (21, 1))
+    ones = np.ones(lcs.n_x + 2 * lcs.n_lam + lcs.n_u)
+    weights = C3Weights(np.diag([0, 200, 1, 20.0]), 0.01 * np.eye(1), ones, ones)
+
+    def plan(**bounds):
+        problem = C3Problem(
+            weights, PLUS, C3Options(N=20, rounds=5), C3Bounds(**bounds)
+        )
+        return solve_c3(lcs, model.x_default, goal, problem)[0]
+
+    with pytest.raises(C3Failure, match="no plan meets the bounds"):
+        plan(x_upper=np.array([np.inf, np.inf, np.inf, -0.02]))
+    forward = plan(x_upper=np.array([np.inf, np.inf, np.inf, 0.05]))
+    assert forward.lam.min() >= -1e-9 and forward.x[1:, 3].max() <= 0.05 + 1e-6
+
+
+def test_bounds_of_inputs_alone_are_never_called_impossible():
+    """40 steps of a system that grows 34 times a step: numbers as far apart as 1e60."""
+    d = np.load(Path(__file__).parent / "reference" / "unstable_40_steps.npz")
+    lcs = LCS(*(d[k] for k in "ABDdEFHc"), float(d["dt"]))
+    bounds = C3Bounds(d["lower"][4:8], d["upper"][4:8])
+    weights = C3Weights(d["Q"], d["R"], d["G"], d["U"])
+    problem = C3Problem(weights, PLUS, C3Options(N=40), bounds)
+    with pytest.raises(C3Failure, match="numerics: rounding leaves open"):
+        solve_c3(lcs, d["x"], d["xd"], problem)

@@ -7,6 +7,7 @@ c3_projections.py projects.
 import numpy as np
 from numba import njit
 
+from makebreak.systems.contact_mpc.numerics.c3_active_set import CANNOT_BE_MET, MET
 from makebreak.systems.contact_mpc.numerics.c3_bounds import solve_bounded, within
 from makebreak.systems.contact_mpc.numerics.c3_projections import (
     FAILED,
@@ -17,10 +18,12 @@ from makebreak.systems.contact_mpc.numerics.c3_qp import factor, new_factor, sol
 from makebreak.systems.contact_mpc.numerics.lcp import SOLVED
 
 # What qp_step returns beside SOLVED.
-NOT_CONVEX, INFEASIBLE = 1, 2
+NOT_CONVEX, INFEASIBLE, NUMERICS = 1, 2, 3
 FAILURES = {
     NOT_CONVEX: "the QP is not strictly convex, or its numbers are not finite",
     INFEASIBLE: "no plan meets the bounds",
+    NUMERICS: "numerics: rounding leaves open whether a plan meets the bounds (are "
+    "weights, or units, far apart?)",
 }
 
 
@@ -125,7 +128,7 @@ def admm_plus(AB, d, C, c, Q, R, Q_N, G, bounds, U, h, x0, lam0, delta, w, round
 
 @njit(cache=True)
 def qp_step(model, weights, bounds, given, found):
-    """One QP of C3; fills found and returns SOLVED, NOT_CONVEX or INFEASIBLE.
+    """One QP of C3; fills found and returns SOLVED, or a key of FAILURES.
 
     Args:
         model: AB = [D B A], d, C = [F H E], c, each (K, ...) with K = 1 or N.
@@ -176,9 +179,12 @@ def qp_step(model, weights, bounds, given, found):
     solve(fac, h, x0, lam0, x, v)
     if bounds is not None:
         lower, upper = bounds
-        if not within(x, v, lower, upper):
-            if not solve_bounded(fac, T, Q_N, h, x0, lam0, lower, upper, sides, x, v):
-                return INFEASIBLE
+        if not within(x, v, lower, upper, n_lam):
+            status = solve_bounded(fac, T, Q_N, h, x0, lam0, lower, upper, sides, x, v)
+            if status != MET:  # Bounds of inputs alone can always be met.
+                free = np.isinf(lower[n_v:]).all() and np.isinf(upper[n_v:]).all()
+                is_sure = status == CANNOT_BE_MET and not free
+                return INFEASIBLE if is_sure else NUMERICS
     for k in range(N):
         z[k, :n_x] = x[k]
         z[k, n_x:i_eta] = v[k]

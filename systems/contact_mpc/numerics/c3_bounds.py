@@ -16,11 +16,13 @@ from makebreak.systems.contact_mpc.numerics.c3_qp import solve
 
 
 @njit(cache=True)
-def within(x, v, lower, upper):
-    """Whether u and x of all knots but x_0 obey lower and upper ((n,), over [v, x])."""
+def within(x, v, lower, upper, n_lam=0):
+    """Whether u and x of all knots but x_0 obey lower and upper ((n,), over [v, x]);
+    the first n_lam of v, contact forces, are not asked: theirs count where others bind.
+    """
     n_v = v.shape[1]
     for k in range(v.shape[0]):
-        for i in range(n_v):
+        for i in range(n_lam, n_v):
             if not lower[i] <= v[k, i] <= upper[i]:
                 return False
         for i in range(x.shape[1]):
@@ -37,15 +39,16 @@ def solve_bounded(fac, T, T_N, h, x0, v0_fixed, lower, upper, sides, x, v):
         there is no bound, lower <= upper. x_0 and the fixed head of v_0 have no bounds.
         sides: (N + 1, n) integers, the bounds to try first: 1 lower, -1 upper, 0 none;
         all zero: the breached ones. Overwritten by the active ones.
-    Returns: whether it converged. If not, as a rule no plan meets the bounds.
+    Returns: MET; CANNOT_BE_MET: a bound contradicts those that are active; UNDECIDED:
+        rounding leaves open whether a plan meets the bounds.
     """
     status = solve_active(fac, h, x0, v0_fixed, lower, upper, sides, x, v)
     if status == MET:
-        return True
+        return MET
     sides[:] = 0
     # The active set may have left a plan that breaks the dynamics.
     solve(fac, h, x0, v0_fixed, x, v)
     for start in IPM_STARTS:
         if solve_interior(fac, T, T_N, h, v0_fixed, lower, upper, start, x, v):
-            return True
-    return False
+            return MET
+    return status
