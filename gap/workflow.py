@@ -35,6 +35,7 @@ from makebreak.gap.data.check_drives import (
 from makebreak.gap.data.check_meshes import check_meshes
 from makebreak.gap.data.checks import check_recordings
 from makebreak.gap.data.conditioning import condition
+from makebreak.gap.data.content import check_contents
 from makebreak.gap.data.findings import Finding
 from makebreak.gap.data.pieces import excerpt
 from makebreak.gap.data.reading import check_against_scene, read_recordings
@@ -198,6 +199,7 @@ def _run(
     go_on()
     checks += check_recordings(parts.decided, scene_facts(dynamics.plant))
     checks += check_tool_weight(dynamics, parts.decided)
+    checks += check_contents(dynamics.plant, parts.decided)
     checks += check_untold(scene, parts.decided)
     is_mechanism = _is_mechanism(dynamics, recordings)
     # An impact would be smeared by means over rows.

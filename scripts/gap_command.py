@@ -233,6 +233,7 @@ def _proposed(
             )
     doubts = proposal.findings()
     notes += [finding.says for finding in doubts if finding.kind == NO_COLUMN]
+    notes += [each.says for each in proposal.said]
     return scene, sidecars, notes, doubts
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from makebreak.gap.data.reading import read_recording
+from makebreak.gap.data.table import read_table
 
 N = 40
 T = np.round(0.01 * np.arange(N), 4)
@@ -251,3 +252,29 @@ def test_a_gzip_file_that_is_cut_is_refused(tmp_path):
     (tmp_path / "a.csv.gz").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(ValueError, match="is no whole gzip file"):
         read_recording(tmp_path / "a.csv.gz")
+
+
+@pytest.mark.parametrize(
+    "stamp, zone",
+    [
+        ("{d}T{t}.{f}", ""),
+        ("{d} {t}.{f}", "Z"),
+        ("{d} {t},{f}", "+01:00"),
+        ('"{d} {t}.{f}"', "+0100"),
+    ],
+)
+def test_dates_are_read_as_seconds(tmp_path, stamp, zone):
+    """2026-11-27 22:00 UTC is 1795816800 s, as `date -u -d ... +%s` says."""
+    hour = 23 if "1" in zone else 22
+    rows = [
+        stamp.format(d="2026-11-27", t=f"{hour}:00:0{k}", f="250") + f"{zone};{k}"
+        if not stamp.startswith('"')
+        else stamp.format(d="2026-11-27", t=f"{hour}:00:0{k}", f=f"250{zone}") + f";{k}"
+        for k in range(9)
+    ]
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(["when;x", *rows]) + "\n")
+    table = read_table(path)
+    np.testing.assert_allclose(
+        table.columns["when"], 1795816800.25 + np.arange(9), atol=1e-6
+    )

@@ -7,6 +7,7 @@ import json
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from datetime import datetime
 from io import BytesIO
 from pathlib import Path
 
@@ -16,13 +17,18 @@ _BLOCK = 1 << 23  # [bytes] of text that are parsed at a time.
 NAMELESS = "column_"  # What columns without a name are called, with their number.
 _SHOWN = 3  # Bad rows that are named one by one.
 _QUOTED = re.compile(rb'"([^"\n]*)"')
+# ISO 8601, as data frames and loggers write it.
+_STAMP = re.compile(
+    rb"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)(?:[.,](\d+))? ?(Z|[+-]\d\d:?\d\d)?"
+)
 
 
 @dataclass(frozen=True)
 class Dialect:
     """How a csv file is written. names: of its columns; lists: {column: how many
     numbers its cells hold}, of cells as [1, 2, 3]; unused: columns that may hold
-    anything; headless: the first line is a row, and the names are column_1, ..."""
+    anything; headless: the first line is a row, and the names are column_1, ...;
+    stamped: some cells are dates with times, which become seconds since 1970."""
 
     separator: str
     decimal_comma: bool
@@ -31,6 +37,7 @@ class Dialect:
     lists: dict[str, int] = field(default_factory=dict)
     unused: frozenset[str] = frozenset()
     headless: bool = False
+    stamped: bool = False
 
     def columns(self) -> list[str]:
         """Names of the columns of numbers: a list's are name[0], name[1], ..."""
@@ -105,7 +112,7 @@ def dialect_of(
     Raises: ValueError for what is no text, or has a column twice.
     """
     try:
-        text = header.decode("utf-8-sig").strip()
+        text = _in_seconds(header).decode("utf-8-sig").strip()
     except UnicodeDecodeError:
         raise ValueError(f"recording {path} is no text: expected a csv table") from None
     plain = re.sub(r'"[^"]*"', "", text)
@@ -122,7 +129,8 @@ def dialect_of(
     for name in names:
         if names.count(name) > 1:
             raise ValueError(f'recording {path}: column "{name}" is there twice')
-    lines = sample.decode(errors="replace").splitlines()[:50]
+    stamped = _STAMP.search(header + sample) is not None
+    lines = _in_seconds(sample).decode(errors="replace").splitlines()[:50]
     lists: dict[str, int] = {}
     if "[" in "".join(lines):
         for cells in csv.reader(lines[:-1] or lines, delimiter=separator):
@@ -137,7 +145,26 @@ def dialect_of(
     # Numbers in quotes with a comma in them, between commas.
     comma |= separator == "," and re.search(r'"-?\d+,\d+"', body) is not None
     unused = unused & set(names)
-    return Dialect(separator, comma, '"' in body, tuple(names), lists, unused, headless)
+    return Dialect(
+        separator, comma, '"' in body, tuple(names), lists, unused, headless, stamped
+    )
+
+
+def _in_seconds(text: bytes) -> bytes:
+    """With dates and times as seconds since 1970; without a zone they are UTC."""
+
+    def seconds(found: re.Match[bytes]) -> bytes:
+        date, clock, fraction, zone = found.groups()
+        # Python 3.10 reads neither a Z nor a zone without a colon.
+        zone = (zone or b"Z").replace(b"Z", b"+00:00")
+        zone = re.sub(rb"(\d\d)(\d\d)$", rb"\1:\2", zone)
+        try:
+            at = datetime.fromisoformat((date + b"T" + clock + zone).decode())
+        except ValueError:
+            return found.group()
+        return b"%d.%s" % (int(at.timestamp()), fraction or b"0")
+
+    return _STAMP.sub(seconds, text)
 
 
 def is_nameless(column: str) -> bool:
@@ -197,6 +224,8 @@ def parse(
     """Numbers (rows, columns) of whole lines, and the number of each row from 1; `done`
     rows came before them."""
     names = dialect.columns()
+    if dialect.stamped:
+        text = _in_seconds(text)
     if dialect.lists:
         return _by_line(dialect, names, text.decode(errors="replace"), done, bad, True)
     plain = text
@@ -301,7 +330,7 @@ def text_columns(path: Path) -> dict[str, str]:
         header = file.readline()
         sample = file.read(1 << 16)
     dialect = dialect_of(path, header, sample)
-    lines = sample.decode(errors="replace").splitlines()[:20]
+    lines = _in_seconds(sample).decode(errors="replace").splitlines()[:20]
     found: dict[str, list[str]] = {}
     for cells in csv.reader(lines, delimiter=dialect.separator):
         if len(cells) == len(dialect.names):

@@ -38,8 +38,22 @@ CURRENT = "a current"  # Why such a column is left out begins so.
 # Of a joint that slides a force is its effort; else it is a wrench's, or nobody's.
 _FORCE, _FORCE_COMMAND = "force", "force_command"
 _OF_A_SLIDE = {_FORCE: "effort_measured", _FORCE_COMMAND: "effort_command"}
-_NEVER = set("temperature temp voltage volt status error mode flag id seq".split())
-_TIME = set("time t timestamp timestamps stamp ts sec secs seconds clock".split())
+_NEVER = set(
+    "temperature temperatures temp temps voltage voltages volt volts status error "
+    "errors err errs mode flag id seq min max limit limits lower upper minimum "
+    "maximum".split()
+)
+# Of an effort: a part of it, or what a model makes of it, and not what drives a joint.
+_PART = set(
+    "external ext gravity grav coriolis friction ff feedforward disturbance residual "
+    "contact".split()
+)
+_BESIDE = set("motor raw unfiltered".split())  # Another column is rather it.
+_TIME = set(
+    "time t timestamp timestamps stamp stamps ts sec secs seconds clock utime datetime "
+    "walltime epoch nsec nsecs usec usecs msec msecs nanoseconds microseconds "
+    "milliseconds".split()
+)
 _EPISODE = set("episode trial run".split())
 _TIME_UNITS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0}
 # Of a velocity to the derivative of its position: unit, factor to rad/s or m/s.
@@ -81,13 +95,15 @@ class JointName:
 @dataclass(frozen=True)
 class Match:
     """What a column is taken for. channel: of a recording, `time`, `episode`, or None:
-    it is left out. why: a few words."""
+    it is left out. why: a few words. may: the channel that one that is left out would
+    be, were another column not."""
 
     column: str
     channel: str | None
     scale: float = 1.0
     offset: float = 0.0
     why: str = ""
+    may: str = ""
 
 
 def words_of(name: str) -> list[str]:
@@ -145,7 +161,12 @@ def propose(
             why = "not a quantity that gap compares"
             if joint is not None:
                 why = f"a current: {joint.name}.effort_measured with its N m/A as scale"
-            found[name] = Match(name, None, why=why)
+            may = f"{joint.name}.effort_measured" if joint is not None else ""
+            found[name] = Match(name, None, why=why, may=may)
+        elif part := _part_of(name, quantity, joint):
+            why = f"{part}: not the whole of what drives a joint"
+            may = f"{joint.name}.{quantity}" if joint is not None else ""
+            found[name] = Match(name, None, why=why, may=may)
         elif joint is None:
             found[name] = Match(name, None, why=f"{quantity} {UNKNOWN_JOINT}")
         else:
@@ -202,7 +223,7 @@ def sidecar_text(matches: Sequence[Match], own: Mapping | None = None) -> str:
         else:
             target = f"{{channel: {match.channel}, scale: {match.scale!r}"
             target += f", offset: {match.offset!r}}}" if match.offset else "}"
-        if match.channel == match.column:
+        if target == match.column:
             continue
         lines.append(f"  {key}: {target}  # {match.why}")
     if len(lines) == 2:
@@ -234,7 +255,7 @@ def _quantity(name: str, named: Sequence[JointName]) -> str | None:
     """What a column is by its words, and by its unit where it has a joint's name.
     named: joints whose name is in the column's."""
     words = words_of(name)
-    if set(words) & _NEVER:
+    if set(words_of(re.sub(r"/\s*min\b", "", name))) & _NEVER - _words_in(named):
         return None
     command = bool(set(words) & _COMMAND)
     kind = next((kind for kind, own in _WORDS.items() if own & set(words)), None)
@@ -242,8 +263,7 @@ def _quantity(name: str, named: Sequence[JointName]) -> str | None:
         kind = _quantity_of_unit(name) or kind
     elif kind is None and named and not command:
         kind = _quantity_of_unit(name)
-        own = {w for joint in named for w in words_of(joint.name.split(".", 1)[1])}
-        if kind is None and set(words) <= own | _NOW:
+        if kind is None and set(words) <= _words_in(named) | _NOW:
             kind = "position"
     if re.search(r"(^|[^a-z])[qv]_d_?\d*$", name.lower()):  # q_d, as in papers.
         command = True
@@ -258,6 +278,18 @@ def _quantity(name: str, named: Sequence[JointName]) -> str | None:
     if kind == "force":
         return _FORCE_COMMAND if command else _FORCE
     return f"{kind}_command" if command else kind
+
+
+def _words_in(joints: Sequence[JointName]) -> set[str]:
+    """Of the names of joints."""
+    return {w for joint in joints for w in words_of(joint.name.split(".", 1)[1])}
+
+
+def _part_of(name: str, quantity: str, joint: JointName | None) -> str:
+    """The word of an effort's name that says that it is a part of it."""
+    own = _words_in([joint]) if joint is not None and _names(name, joint) else set()
+    parts = [w for w in words_of(name) if w in _PART - own]
+    return parts[0] if parts and quantity.startswith("effort") else ""
 
 
 def _quantity_of_unit(name: str) -> str | None:
@@ -379,19 +411,21 @@ def _sharing_words(
 
 
 def _once(found: dict[str, Match], said: Mapping[str, Match]) -> dict[str, Match]:
-    """Each channel of one column: what is said, else the first that has it."""
+    """Each channel of one column: what is said, else the first that has it, and those
+    of a motor's side or raw after others."""
     taken: set[str | None] = {
         m.channel for m in found.values() if m.channel == m.column
     }
     taken |= {m.channel for m in said.values()}
-    out = {}
-    for name, match in found.items():
+    out = dict(found)
+    for name in sorted(found, key=lambda name: bool(set(words_of(name)) & _BESIDE)):
+        match = found[name]
         if name not in said and match.channel not in (None, match.column):
             if match.channel in taken:
-                match = Match(name, None, why=f"{match.channel} is another column")
+                why = f"{match.channel} is another column"
+                out[name] = Match(name, None, why=why, may=str(match.channel))
             else:
                 taken.add(match.channel)
-        out[name] = match
     return out
 
 
@@ -495,7 +529,8 @@ def _without_unknown_efforts(
     for match, unit, scale in _units_said(found, joints):
         if scale is None:
             why = f"in {unit}, and of what is not said: give channel and scale"
-            out[match.column] = Match(match.column, None, why=why)
+            may = str(match.channel)
+            out[match.column] = Match(match.column, None, why=why, may=may)
     return out
 
 
@@ -562,7 +597,10 @@ def _in_si_by_size(found, told, columns, of) -> dict[str, Match]:
         if match.channel is None or name not in columns:
             continue
         at, _, what = match.channel.rpartition(".")
-        if what in ("position", "position_command") and degrees.get(_template(name)):
+        turns = (
+            at in of and not of[at].prismatic
+        )  # Degrees of one that slides are none.
+        if turns and "position" in what and degrees.get(_template(name)):
             why = "in degrees, by its name or its size"
             out[name] = Match(name, match.channel, DEG, why=f"{match.why}; {why}")
         elif what in ("position", "position_command") and at in millimetres:
@@ -614,7 +652,9 @@ def _in_degrees(name: str, value: np.ndarray, joint: JointName) -> bool:
     most = float(np.nanmax(np.abs(value)))
     limit = max(abs(joint.lower), abs(joint.upper))
     if np.isfinite(limit):
-        return most > 2.0 * limit and DEG * most < 1.3 * limit
+        # From 0 to 360, where the joint counts from -180.
+        reach = most if np.nanmin(value) < 0.0 or most > 361.0 else 0.5 * most
+        return most > 2.0 * limit and DEG * reach < 1.3 * limit
     return most > 20.0
 
 

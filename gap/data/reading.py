@@ -30,6 +30,7 @@ from makebreak.gap.data.table import (
     read_table,
     stem_of,
 )
+from makebreak.gap.data.turns import without_turns
 
 MOST_VALUE = 1e12  # In SI units nothing that a robot measures is larger.
 _TIME_UNITS = ((1e-3, "ms"), (1e-6, "us"), (1e-9, "ns"), (0.0, "no unit of time"))
@@ -111,6 +112,7 @@ def read_recording(
     spans = sidecar.get("ignore") or []
     episodes, more = without_ignored(path, episodes, time, spans)
     notes = [*done, *notes, *more, *_without_empty(path, columns)]
+    notes += _without_turns(path, columns, episodes)
     _check_sizes(path, columns, row)
     flips, norm_errors = mend_quaternions(path, columns, episodes, row)
     if is_excerpt:
@@ -281,6 +283,24 @@ def _without_empty(path: Path, columns: dict[str, np.ndarray]) -> list[tuple[str
         ("channel_empty", f"{path.name}: {name} has no sample at all and is left out")
         for name in empty
     ]
+
+
+def _without_turns(path: Path, columns, episodes) -> list[tuple[str, str]]:
+    """Undoes jumps of joints' positions by whole turns, in place, and says so."""
+    notes = []
+    for name, value in columns.items():
+        if name.rpartition(".")[2] not in ("position", "position_command"):
+            continue
+        n = 0
+        for e in episodes:
+            columns[name][e.rows], more = without_turns(value[e.rows])
+            n += more
+        if n:
+            says = (
+                f"{path.name}: {name} jumps by a whole turn {n} times; that was undone"
+            )
+            notes.append(("position_turns", says))
+    return notes
 
 
 def _check_sizes(path: Path, columns: Mapping[str, np.ndarray], row: np.ndarray):

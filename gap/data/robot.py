@@ -12,6 +12,7 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 
+from makebreak.gap.data.content import Contents, Said, by_content, told_by
 from makebreak.gap.data.csv_table import text_columns
 from makebreak.gap.data.findings import (
     FIXED,
@@ -244,7 +245,8 @@ class Proposal:
     joints that have no column of a position; unused: columns of quantities of unknown
     joints. fixed: joints that are taken to stand still. first: the first log's name.
     copies: {name beside the scene: text} of models that are not used as they are.
-    unread: what of the robot's file is not used."""
+    unread: what of the robot's file is not used. said: what columns' contents say
+    beside their names."""
 
     scene: str
     sidecars: dict[Path, str]
@@ -257,11 +259,15 @@ class Proposal:
     first: str = ""
     copies: Mapping[str, str] = field(default_factory=dict)
     unread: tuple[str, ...] = ()
+    said: tuple[Said, ...] = ()
 
     def findings(self) -> list[Finding]:
         """What a result must not forget."""
         name = self.first
-        found = []
+        found = [
+            Finding(each.kind, name, each.channel, each.size, "", "warning", each.says)
+            for each in self.said
+        ]
         if self.gains_of:
             says = (
                 f"The gains of the drives in this proposed scene are {self.gains_of}: "
@@ -304,14 +310,21 @@ def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
 
     Raises: ValueError where no joint's position or no time is found.
     """
-    every = {log.path: of_one_drive(matches_of(log, robot)) for log in logs}
+    every = {log.path: matches_of(log, robot) for log in logs}
     unused = dict.fromkeys(m.column for matches in every.values() for m in matches
                            if m.why.endswith(UNKNOWN_JOINT))  # fmt: skip
     every = {path: _through_gears(robot, own) for path, own in every.items()}
+    said: list[Said] = []
     fixed = _standing(robot, every, logs, bool(unused))
     if fixed:
         robot = _with_fixed(robot, fixed)
         every = {path: _left_out(matches, fixed) for path, matches in every.items()}
+    for log in logs:
+        matches, more = by_content(
+            robot.plant, robot.joints, log.table.columns, every[log.path]
+        )
+        every[log.path] = of_one_drive(matches)
+        said += [each for each in more if each not in said]
     kinds: dict[str, list[str]] = {}
     for path, matches in every.items():
         channels = {m.channel for m in matches if m.channel}
@@ -364,7 +377,7 @@ def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
         notes.append(f"{', '.join(fixed)} {_stands(fixed)}")
     actuation, gains = _actuation(robot, kinds, every, logs, notes)
     if actuation == NO_ACTUATION:
-        _check_currents(every)
+        _check_currents(every, robot, logs)
     gravity = list(robot.file.gravity)
     own = "" if gravity == [0.0, 0.0, -9.81] else f", gravity: {gravity}"
     lines += [f"plant: {{time_step: 0.001{own}}}", *actuation]
@@ -390,6 +403,7 @@ def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
         stem_of(logs[0].path),
         copies,
         robot.file.notes,
+        tuple(said),
     )
 
 
@@ -431,20 +445,37 @@ def _through_gears(robot: Robot, matches: Sequence[Match]) -> list[Match]:
     return out
 
 
-def _check_currents(every: Mapping[Path, Sequence[Match]]) -> None:
-    """Raises: ValueError where motors' currents are all that says what drives a robot:
-    no effect could be told from the torques that are missing."""
-    for path, matches in every.items():
-        currents = [m for m in matches if m.why.startswith(f"{CURRENT}: ")]
+def _check_currents(
+    every: Mapping[Path, Sequence[Match]], robot: Robot, logs: Sequence[Log]
+) -> None:
+    """Raises: ValueError where motors' currents, or efforts in a unit that says too
+    little, are all that says what drives a robot: no effect could be told from the
+    torques that are missing."""
+    for log in logs:
+        matches = every[log.path]
+        currents = [
+            m for m in matches if m.channel is None and m.may
+            and m.why.startswith((f"{CURRENT}: ", "in "))
+        ]  # fmt: skip
         if not currents:
             continue
-        joint = currents[0].why.removeprefix(f"{CURRENT}: ").split()[0]
+        try:
+            contents = Contents(robot.plant, robot.joints, log.table.columns, matches)
+            told = told_by(contents, matches)
+        except ValueError:
+            told = {}
+        first = currents[0]
+        scale = f"{told[first.column].factor:.3g}" if first.column in told else "0.11"
+        shown = [f"{m.column}: {told[m.column].factor:.3g}" for m in currents
+                 if m.column in told]  # fmt: skip
         more = f" (and {len(currents) - 1} more)" if len(currents) > 1 else ""
+        if shown:
+            more += f"; by the masses of the model it is {', '.join(shown)}"
         raise ValueError(
-            f"recording {path}: motors' currents are all that says what drives the "
-            f"joints; give their N m/A at the joint in {stem_of(path)}.yaml beside it: "
-            f'columns: {{"{currents[0].column}": {{channel: {joint}, scale: 0.11}}}}'
-            f"{more}"
+            f"recording {log.path}: motors' currents are all that says what drives the "
+            f"joints; give their N m/A at the joint in {stem_of(log.path)}.yaml beside "
+            f'it: columns: {{"{first.column}": {{channel: {first.may}, scale: {scale}}}'
+            f"}}{more}"
         )
 
 

@@ -83,12 +83,12 @@ def _equations(plant: MultibodyPlant, motion: ServoLog):
     that the robot needs (m,), while it moves; all averaged by one kernel."""
     t, n = motion.time, motion.q.shape[1]
     none = (np.zeros((0, 4)), np.zeros(0))
-    averaged = _averaged(motion)
+    averaged = averaged_motion(motion)
     if averaged is None:
         return [none] * n
     even, step, width, kernels, (mean, rate, rate2) = averaged
     some = slice(None, None, max(len(mean) // MOST_SAMPLES, 1))
-    needed = _needed(plant, mean[some], rate[some], rate2[some])
+    needed = needed_efforts(plant, mean[some], rate[some], rate2[some])
     out = []
     for i, command in enumerate(motion.command.T):
         there = np.flatnonzero(np.isfinite(command))
@@ -106,7 +106,7 @@ def _equations(plant: MultibodyPlant, motion: ServoLog):
     return out
 
 
-def _averaged(motion: ServoLog):
+def averaged_motion(motion: ServoLog):
     """Even times (m,), their step, a kernel's width, the kernels, and the joints' mean
     positions, rates and accelerations by them; None where a log is too short."""
     t = motion.time
@@ -133,14 +133,14 @@ def effort_shares(plant: MultibodyPlant, motions: Sequence[ServoLog]) -> np.ndar
     """
     squares = np.zeros((2, plant.num_positions()))
     for motion in motions:
-        averaged = _averaged(motion)
+        averaged = averaged_motion(motion)
         if averaged is None:
             continue
         states = averaged[-1]
         some = slice(None, None, max(len(states[0]) // MOST_SAMPLES, 1))
         q, v, vd = (x[some] for x in states)
-        needed = _needed(plant, q, v, vd)
-        weight = _needed(plant, q, np.zeros_like(v), np.zeros_like(vd))
+        needed = needed_efforts(plant, q, v, vd)
+        weight = needed_efforts(plant, q, np.zeros_like(v), np.zeros_like(vd))
         squares[0] += np.sum(needed**2, axis=0)
         squares[1] += np.sum(weight**2 + (needed - weight) ** 2, axis=0)
     with np.errstate(invalid="ignore"):
@@ -171,7 +171,7 @@ def _bump(width: int, step: float) -> list[np.ndarray]:
     return [mean, rate / -np.sum(rate * t), 2.0 * rate2 / np.sum(rate2 * t**2)]
 
 
-def _needed(plant: MultibodyPlant, q, v, vd) -> np.ndarray:
+def needed_efforts(plant: MultibodyPlant, q, v, vd) -> np.ndarray:
     """(m, n) efforts by inverse dynamics at states (m, n)."""
     context, out = plant.CreateDefaultContext(), np.empty(q.shape)
     forces = MultibodyForces(plant)

@@ -320,6 +320,8 @@ def _read_npz(path: Path, most_cells: int, unused) -> RecordingTable:
                 value = file[name]
                 if not isinstance(value, np.ndarray):
                     raise ValueError(f"recording {path}: {name} is no array")
+                if value.dtype.kind == "M":
+                    value = value.astype("datetime64[ns]").astype(np.int64) * 1e-9
                 if value.ndim not in (1, 2) or value.dtype.kind not in "iufb":
                     raise ValueError(
                         f"recording {path}: column {name} is {value.shape} of "
@@ -365,7 +367,7 @@ def _read_parquet(path: Path, most_cells: int, unused) -> RecordingTable:
             inner = inner.value_type
         if not (
             kind.is_integer(inner) or kind.is_floating(inner) or kind.is_null(inner)
-            or kind.is_boolean(inner)
+            or kind.is_boolean(inner) or kind.is_timestamp(field.type)
         ):  # fmt: skip
             raise ValueError(
                 f"recording {path}: column {field.name} is of type {field.type}, "
@@ -395,7 +397,10 @@ def _read_parquet(path: Path, most_cells: int, unused) -> RecordingTable:
 
 
 def _numbers(path: Path, arrow, name: str, value) -> np.ndarray:
-    """(n,) of a column, or (n, k) of one of lists."""
+    """(n,) of a column, or (n, k) of one of lists; dates in seconds since 1970."""
+    if arrow.types.is_timestamp(value.type):
+        ns = value.cast(arrow.timestamp("ns", value.type.tz)).cast(arrow.int64())
+        return 1e-9 * ns.to_numpy(zero_copy_only=False)
     if arrow.types.is_list(value.type) or arrow.types.is_fixed_size_list(value.type):
         rows = value.to_pylist()
         k = max((len(row) for row in rows if row is not None), default=0)

@@ -1,0 +1,538 @@
+"""What columns are by what is in them.
+
+A name is a claim; what a column holds has to follow from the others. Positions give
+velocities, and by the model the efforts that joints need; every column is regressed on
+what is so predicted for every joint, with dry and viscous friction and a bias free:
+
+    predicted = factor column + bias + viscous v + coulomb sign(v)
+
+One table of these relations tells a unit, a gear, a motor's side or a torque constant
+(the factor), a sign, columns that are swapped or numbered one off (the joint that
+fits), and a column that drives nothing (no joint fits, or nothing is in it).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from pydrake.multibody.plant import MultibodyPlant
+from scipy.optimize import linear_sum_assignment
+
+from makebreak.gap.data.findings import Finding
+from makebreak.gap.data.proposal import AS_SAID, CURRENT, JointName, Match
+from makebreak.gap.data.recording import Recording
+from makebreak.gap.data.servo_gains import (
+    ServoLog,
+    averaged_motion,
+    needed_efforts,
+)
+from makebreak.gap.data.turns import TURN, without_turns
+from makebreak.models.effects.kind import full_name, one_dof_joints
+
+MOST_SAMPLES = 1000  # At which inverse dynamics is computed.
+MOST_SEC = 60.0  # Of a log that is looked at.
+EXPLAINS, NOTHING = 0.9, 0.5  # Shares of what is predicted: is told by it, is not.
+CLEARER = 5.0  # Times less is left by another joint's column than by its own.
+PARTS = 5  # Of the data: a factor scatters over them.
+KNOWN_TO, ALIKE = 0.1, 0.03  # Of a factor, 1 sigma; of factors of one robot.
+# A search takes factors of drives between these for a gain of the actuator; without a
+# gain, masses would have to make up for others.
+GAINS = (0.45, 1.6)
+# Of one joint alone, what it carries may make its effort so many times larger; what
+# holds it up, smaller.
+LARGE, LARGER = 20.0, 3.0
+_DRIVES = ("effort_command", "effort_measured")
+_UNITS = (
+    (1e-3, "as if in N mm, or per mille of N m"), (1e-2, "as if in N cm, or per cent"),
+    (1e3, "as if in kN m"), (0.0980665, "as if in kgf cm"),
+    (9.80665, "as if in kgf m"), (0.112985, "as if in lbf in"),
+    (1.355818, "as if in lbf ft"),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Likeness:
+    """What is predicted = factor column + rest. std: of the factor, by its scatter over
+    parts of the data. explained: of what the rest leaves, the share that the column
+    takes."""
+
+    factor: float
+    std: float
+    explained: float
+
+
+@dataclass(frozen=True)
+class Said:
+    """What a column's content says of it: as a Finding, of a log that is not named."""
+
+    kind: str
+    channel: str
+    size: float
+    says: str
+
+
+def likeness(predicted, column, rest) -> Likeness | None:
+    """None where there is nothing to relate.
+
+    Args: predicted (m,), column (m,), rest (m, k).
+    """
+    if not (np.ptp(predicted) > 0.0 and np.ptp(column) > 0.0):
+        return None
+    size = float(np.std(column))
+    X = np.column_stack([column / size, rest])
+    good = np.ones(len(predicted), bool)
+    for _ in range(3):  # Someone may have pushed it for a while.
+        c = np.linalg.lstsq(X[good], predicted[good], rcond=1e-9)[0]
+        off = np.abs(predicted - X @ c)
+        good = off <= max(6.0 * float(np.median(off)), 1e-12)
+    y, X = predicted[good], X[good]
+    alone = y - X[:, 1:] @ np.linalg.lstsq(X[:, 1:], y, rcond=1e-9)[0]
+    whole = y - X @ np.linalg.lstsq(X, y, rcond=1e-9)[0]
+    if not alone @ alone > 1e-12 * max(y @ y, 1e-300):
+        return None
+    each = [
+        np.linalg.lstsq(A, b, rcond=1e-9)[0][0]
+        for A, b in zip(np.array_split(X, PARTS), np.array_split(y, PARTS), strict=True)
+    ]
+    share = 1.0 - float(whole @ whole) / float(alone @ alone)
+    std = float(np.std(each)) / np.sqrt(PARTS)
+    return Likeness(float(c[0]) / size, std / size, share)
+
+
+class Contents:
+    """A log's columns beside what its positions predict.
+
+    Args: columns {name: (n,)}; matches of them, which name time and all joints'
+        positions; joints in the order of the plant's coordinates.
+    Raises: ValueError where these do not tell a motion.
+    """
+
+    def __init__(
+        self,
+        plant: MultibodyPlant,
+        joints: Sequence[JointName],
+        columns: Mapping[str, np.ndarray],
+        matches: Sequence[Match],
+    ):
+        self._plant, self.joints = plant, joints
+        self._columns = columns
+        found = {m.channel: m for m in matches if m.channel}
+        names = [f"{j.name}.position" for j in joints]
+        if plant.num_positions() != len(joints) or not {*names, "time"} <= {*found}:
+            raise ValueError("not all joints are measured")
+        time = _si(columns, found["time"])
+        q = np.stack(
+            [without_turns(_si(columns, found[name]))[0] for name in names], axis=1
+        )
+        rows = np.flatnonzero(np.isfinite(q).all(axis=1) & np.isfinite(time))
+        if not len(rows):
+            raise ValueError("no row has all positions")
+        starts = np.flatnonzero(np.diff(time[rows], prepend=np.inf) <= 0.0)
+        self._rows = max(np.split(rows, starts), key=len)
+        t = time[self._rows]
+        self._rows = self._rows[: np.searchsorted(t, t[0] + MOST_SEC)]
+        self._time = time[self._rows]
+        self._all_time = time
+        self.moved(range(len(joints)), q)
+
+    def moved(self, order: Sequence[int], q: np.ndarray | None = None) -> None:
+        """With the positions (n, n_q), or those of before in another order."""
+        if q is not None:
+            self._q = q[self._rows]
+        averaged = averaged_motion(
+            ServoLog(self._time, self._q[:, list(order)], self._q)
+        ) if len(self._time) > 20 else None  # fmt: skip
+        if averaged is None:
+            raise ValueError("the log is too short")
+        self._even, _, _, self._kernels, states = averaged
+        self._some = slice(None, None, max(len(states[0]) // MOST_SAMPLES, 1))
+        self.q, self.v, self.vd = (x[self._some] for x in states)
+        self.needed = needed_efforts(self._plant, self.q, self.v, self.vd)
+
+    def moves(self, i: int) -> bool:
+        """Whether a joint does, by more than its position's grid or noise."""
+        return float(np.ptp(self.q[:, i])) > 1e-3
+
+    def column(self, name: str) -> np.ndarray | None:
+        """(m,) averaged as the motion is; None where it has too few samples."""
+        y = self._columns[name]
+        inside = np.zeros(len(y), bool)
+        inside[self._rows[0] : self._rows[-1] + 1] = True
+        there = np.isfinite(y) & inside & np.isfinite(self._all_time)
+        if there.sum() < 20:
+            return None
+        even = np.interp(self._even, self._all_time[there], y[there])
+        return np.convolve(even, self._kernels[0], "valid")[self._some]
+
+    def of_velocity(self, name: str, i: int) -> Likeness | None:
+        y = self.column(name)
+        one = np.ones((len(self.v), 1))
+        return None if y is None else likeness(self.v[:, i], y, one)
+
+    def of_effort(self, name: str, i: int, rotor: bool = False) -> Likeness | None:
+        """rotor: free, too."""
+        y, v = self.column(name), self.v[:, i]
+        if y is None:
+            return None
+        rest = [np.ones_like(v), v, np.sign(v), *([self.vd[:, i]] if rotor else [])]
+        return likeness(self.needed[:, i], y, np.stack(rest, axis=1))
+
+
+def _si(columns, match: Match) -> np.ndarray:
+    return match.scale * columns[match.column] + match.offset
+
+
+def by_content(
+    plant: MultibodyPlant,
+    joints: Sequence[JointName],
+    columns: Mapping[str, np.ndarray],
+    matches: Sequence[Match],
+) -> tuple[list[Match], list[Said]]:
+    """Matches as the columns' contents have them, and what they say beside their names.
+    What a sidecar said stays as it is."""
+    said: list[Said] = []
+    matches = _without_empty(columns, matches, said)
+    matches = _within_limits(joints, columns, matches, said)
+    try:
+        contents = Contents(plant, joints, columns, matches)
+    except ValueError:
+        return matches, said
+    matches = _rightly_ordered(contents, matches, said)
+    matches = _drives_that_drive(contents, matches, said)
+    return _with_factors(contents, matches, said), said
+
+
+# ----- What has no content
+
+
+def _without_empty(columns, matches: Sequence[Match], said) -> list[Match]:
+    """Without efforts and commands that stay the same while their joint moves; another
+    column of the same channel takes their place."""
+    position = {
+        m.channel: m for m in matches if (m.channel or "").endswith(".position")
+    }
+    out = list(matches)
+    for k, match in enumerate(matches):
+        at, _, what = (match.channel or "").rpartition(".")
+        own = position.get(f"{at}.position")
+        if what not in (*_DRIVES, "position_command", "velocity_command"):
+            continue
+        y = columns[match.column]
+        y = y[np.isfinite(y)]
+        moves = own is not None and np.nanstd(columns[own.column]) > 0.0
+        if len(y) and (np.ptp(y) > 0.0 or not moves) or match.why == AS_SAID:
+            continue
+        why = "empty" if not len(y) else f"{y[0]:.4g} throughout while the joint moves"
+        out[k] = replace(match, channel=None, why=f"{what}: {why}, so it is no drive")
+        says = f"Column {match.column} is {why}: it is not what drives {at}."
+        said.append(Said("no_content", at, 0.0, says))
+        for j, other in enumerate(out):
+            if other.may == match.channel and not other.why.startswith(CURRENT):
+                why = f"in place of {match.column}, which is {why}"
+                out[j] = replace(other, channel=other.may, may="", why=why)
+                break
+    return out
+
+
+def _within_limits(joints, columns, matches: Sequence[Match], said) -> list[Match]:
+    """Positions that a whole turn less, or more, brings within the joint's limits."""
+    of, out = {j.name: j for j in joints}, []
+    for m in matches:
+        at, _, what = (m.channel or "").rpartition(".")
+        joint = of.get(at)
+        own = what in ("position", "position_command") and m.why != AS_SAID
+        if own and joint is not None and np.isfinite(joint.upper - joint.lower):
+            q = without_turns(_si(columns, m))[0]
+            low, high = np.nanmin(q), np.nanmax(q)
+            middle = 0.5 * (joint.lower + joint.upper)
+            turn = TURN * np.rint((0.5 * (low + high) - middle) / TURN)
+            room = 0.1 * (joint.upper - joint.lower)
+            fits = joint.lower - room < low - turn and high - turn < joint.upper + room
+            if turn and fits and not joint.prismatic:
+                says = (
+                    f"Column {m.column} counts from another turn than the limits of "
+                    f"{at}: {-turn / TURN:+.0f} turn"
+                )
+                said.append(Said("position_turns", f"{at}.{what}", turn, f"{says}."))
+                why = f"{m.why}; {-turn / TURN:+.0f} turn, by the joint's limits"
+                m = replace(m, offset=float(m.offset - turn), why=why)
+        out.append(m)
+    return out
+
+
+# ----- Whose column it is
+
+
+def _rightly_ordered(contents: Contents, matches, said) -> list[Match]:
+    """With the columns of velocities, or positions, or efforts at the joints that they
+    fit, where that is clear."""
+    n = len(contents.joints)
+    speeds = _columns_of(contents, matches, ("velocity",))
+    efforts = _columns_of(contents, matches, _DRIVES)
+    order = _order(speeds, contents.of_velocity, n)
+    if order is not None:
+        before = _fit(contents, efforts)
+        moved = [int(k) for k in np.argsort(order)]
+        contents.moved(moved)
+        if _fit(contents, efforts) > before + 0.2:
+            return _reordered(contents, matches, ("position",), moved, said)
+        contents.moved(range(n))
+        matches = _reordered(contents, matches, ("velocity",), order, said)
+    order = _order(efforts, contents.of_effort, n)
+    if order is not None:
+        matches = _reordered(contents, matches, _DRIVES, order, said)
+    return matches
+
+
+def _columns_of(contents: Contents, matches, quantities) -> dict[int, str]:
+    """{joint's number: column} that no sidecar has said."""
+    number = {j.name: i for i, j in enumerate(contents.joints)}
+    found: dict[int, str] = {}
+    for what in reversed(quantities):  # The first of them wins.
+        for m in matches:
+            at, _, own = (m.channel or "").rpartition(".")
+            if own == what and at in number and m.why != AS_SAID:
+                found[number[at]] = m.column
+    return found
+
+
+def _fit(contents: Contents, efforts: Mapping[int, str]) -> float:
+    each = [contents.of_effort(name, i) for i, name in efforts.items()]
+    return float(np.mean([0.0 if x is None else x.explained for x in each] or [0.0]))
+
+
+def _order(columns: Mapping[int, str], relation, n: int) -> list[int] | None:
+    """(n,) whose column fits each joint; None where the names are right, or it is not
+    clear that they are wrong."""
+    if len(columns) < 2:
+        return None
+    left = np.full((n, n), 1.0)  # Of joint i by the column of joint k.
+    for k, name in columns.items():
+        for i in columns:
+            found = relation(name, i)
+            left[i, k] = 1.0 if found is None else 1.0 - found.explained
+    there = list(columns)
+    cost = np.log(np.maximum(left, 1e-3))[np.ix_(there, there)]
+    order = list(range(n))
+    for i, k in zip(*linear_sum_assignment(cost), strict=True):
+        order[there[i]] = there[k]
+    wrong = [i for i in range(n) if order[i] != i]
+    clear = all(
+        left[i, order[i]] < 1.0 - EXPLAINS and left[i, i] > CLEARER * left[i, order[i]]
+        for i in wrong
+    )
+    return order if wrong and clear else None
+
+
+def _reordered(contents, matches, quantities, order: Sequence[int], said):
+    """Matches of these quantities, with joint i's column that of joint order[i]."""
+    names = [j.name for j in contents.joints]
+    to = {names[k]: names[i] for i, k in enumerate(order)}
+    out, moved = [], []
+    for m in matches:
+        at, _, what = (m.channel or "").rpartition(".")
+        if what in quantities and to.get(at, at) != at and m.why != AS_SAID:
+            channel = f"{to[at]}.{what}"
+            why = f"by its content; its name says {at.split('.', 1)[1]}"
+            m = replace(m, channel=channel, why=why)
+            moved.append(f"{m.column} is {channel}")
+        out.append(m)
+    wrong = [i for i, k in enumerate(order) if i != k]
+    steps = {(order[i] - i) % len(names) for i in wrong}
+    if len(wrong) == 2:
+        kind, word = "columns_swapped", "two columns are swapped"
+    elif steps in ({1}, {len(names) - 1}):
+        kind, word = "columns_shifted", "columns are numbered one off"
+    else:
+        kind, word = "columns_mixed", "columns are in another order"
+    says = f"By what is in them, {word}: {'; '.join(moved)}."
+    said.append(Said(kind, f"{names[wrong[0]]}.{quantities[-1]}", len(wrong), says))
+    return out
+
+
+# ----- What drives a joint
+
+
+def _drives_that_drive(contents: Contents, matches, said) -> list[Match]:
+    """An effort that explains nothing of what its joint needs gives its place to
+    another column that does."""
+    out = list(matches)
+    for i, joint in enumerate(contents.joints):
+        if not contents.moves(i):
+            continue
+        mine = [f"{joint.name}.{what}" for what in _DRIVES]
+        own = [k for k, m in enumerate(out) if m.channel in mine and m.why != AS_SAID]
+        others = [k for k, m in enumerate(out)
+                  if m.may in mine and not m.why.startswith(CURRENT)]  # fmt: skip
+        share = {k: _share(contents, out[k].column, i) for k in (*own, *others)}
+        best = max((*own, *others), key=lambda k: share[k], default=None)
+        for k in own:
+            if best is None or not share[k] < NOTHING < EXPLAINS < share[best]:
+                continue
+            match = out[k]
+            what = str(match.channel).rsplit(".", 1)[1]
+            why = f"{what}: it explains {share[k]:.0%} of what the joint needs"
+            out[k] = replace(match, channel=None, why=why)
+            instead = out[best]
+            if best in others:
+                why = f"it explains {share[best]:.0%} of what the joint needs"
+                out[best] = replace(instead, channel=instead.may, may="", why=why)
+            says = (
+                f"Column {match.column} explains {max(share[k], 0.0):.0%} of the "
+                f"effort that {joint.name} needs, and {instead.column} "
+                f"{share[best]:.0%}: that is taken for what drives it."
+            )
+            said.append(Said("no_content", joint.name, share[k], says))
+    return out
+
+
+def _share(contents: Contents, column: str, i: int) -> float:
+    found = contents.of_effort(column, i)
+    return 0.0 if found is None else found.explained
+
+
+# ----- Factors and signs
+
+
+def _with_factors(contents: Contents, matches, said) -> list[Match]:
+    out = list(matches)
+    for what in _DRIVES:
+        found: dict[int, tuple[int, Likeness]] = {}
+        for k, m in enumerate(out):
+            at, _, own = (m.channel or "").rpartition(".")
+            numbers = [i for i, j in enumerate(contents.joints) if j.name == at]
+            if own == what and numbers and m.why != AS_SAID:
+                x = contents.of_effort(m.column, numbers[0])
+                if x is not None:
+                    found[numbers[0]] = (k, x)
+        factors = _factors(contents, {
+            i: (out[k].column, replace(x, factor=x.factor / out[k].scale,
+                                       std=abs(x.std / out[k].scale)))
+            for i, (k, x) in found.items()
+        })  # fmt: skip
+        for i, (factor, word) in factors.items():
+            k, _ = found[i]
+            m = out[k]
+            out[k] = replace(m, scale=m.scale * factor, why=f"{m.why}; {word}")
+        for word in dict.fromkeys(word for _, word in factors.values()):
+            mine = [i for i, (_, own) in factors.items() if own == word]
+            names = ", ".join(out[found[i][0]].column for i in mine)
+            scales = sorted({f"{factors[i][0]:.4g}" for i in mine}, key=float)
+            says = f"{names}: {word}. Taken times {', '.join(scales)}"
+            if abs(factors[mine[0]][0]) != 1.0:
+                says += "; or the masses of the model are off by that, all alike"
+            kind = "effort_sign" if abs(factors[mine[0]][0]) == 1.0 else "effort_factor"
+            channel = f"{contents.joints[mine[0]].name}.{what}"
+            said.append(Said(kind, channel, factors[mine[0]][0], f"{says}."))
+    return out
+
+
+def _factors(
+    contents: Contents, found: Mapping[int, tuple[str, Likeness]]
+) -> dict[int, tuple[float, str]]:
+    """{joint: (what its effort is to be multiplied with, as what it looks)} where that
+    is no gain of an actuator."""
+    sure = {
+        i: x.factor for i, (name, x) in found.items()
+        if x.explained > EXPLAINS and x.std < KNOWN_TO * abs(x.factor)
+        and (abs(x.factor) > GAINS[1] or _not_a_rotor(contents, name, i, x.factor))
+    }  # fmt: skip
+    odd = {i: f for i, f in sure.items() if not GAINS[0] < f < GAINS[1]}
+    if not odd:
+        return {}
+    middle = float(np.median(list(odd.values())))
+    alike = all(abs(f / middle - 1.0) < ALIKE for f in sure.values())
+    alike &= len(sure) > 1 or abs(middle) > 1.0
+    if not alike:  # Loads and springs make some efforts larger, or smaller.
+        odd = {i: f for i, f in odd.items()
+               if f < 0.0 or not 1.0 / LARGE < f < LARGER}  # fmt: skip
+    if alike:  # Of joints that do not tell, as of those that do.
+        odd = dict.fromkeys(found, middle)
+    out = {}
+    for i, factor in odd.items():
+        std = found[i][1].std if not alike else ALIKE / 6.0 * abs(factor)
+        out[i] = _in_words(factor, std)
+    return out
+
+
+def _not_a_rotor(contents: Contents, name: str, i: int, factor: float) -> bool:
+    """Whether a factor stays where a rotor's inertia is free: what an effort is too
+    large by may turn one that the model lacks."""
+    x = contents.of_effort(name, i, rotor=True)
+    return (
+        x is not None and x.std < KNOWN_TO * abs(x.factor)
+        and abs(x.factor / factor - 1.0) < KNOWN_TO
+    )  # fmt: skip
+
+
+def _in_words(factor: float, std: float) -> tuple[float, str]:
+    """A factor, as round as it may be, and what it looks like."""
+    size, sign = abs(factor), float(np.sign(factor))
+    other = "of the other sign than the model needs"
+    if GAINS[0] < size < GAINS[1]:
+        return sign, other
+    word = ""
+    for unit, name in _UNITS:
+        if abs(size / unit - 1.0) < ALIKE:
+            size, word = unit, name
+    if not word:
+        size = _round(size, max(2.0 * std, 0.005 * size))
+        ratio = size if size > 1.0 else 1.0 / size
+        word = (
+            f"{ratio:.3g} times {'smaller' if size > 1.0 else 'larger'} than the model "
+            "needs, as on the motor's side of a gear, in amperes or in another unit"
+        )
+    return sign * size, word + (f", and {other}" if sign < 0.0 else "")
+
+
+def _round(x: float, within: float) -> float:
+    """The number of fewest digits that is so near."""
+    for digits in range(1, 8):
+        y = float(f"{x:.{digits - 1}e}")
+        if abs(y - x) <= within:
+            return y
+    return x
+
+
+def told_by(contents: Contents, matches: Sequence[Match]) -> dict[str, Likeness]:
+    """{column of a motor's current, or in a unit that says too little: what an effort
+    is, times it} where the model tells that."""
+    number = {j.name: i for i, j in enumerate(contents.joints)}
+    out = {}
+    for m in matches:
+        i = number.get(m.may.rpartition(".")[0])
+        if m.channel is None and i is not None:
+            x = contents.of_effort(m.column, i)
+            if x is not None and x.explained > EXPLAINS:
+                out[m.column] = x
+    return out
+
+
+def check_contents(
+    plant: MultibodyPlant, recordings: Sequence[Recording]
+) -> list[Finding]:
+    """What channels' contents say against their names: until that is put right, an
+    effect would only make up for it."""
+    joints = [
+        JointName(full_name(plant, j), j.type_name() == "prismatic")
+        for j in sorted(one_dof_joints(plant), key=lambda j: j.position_start())
+        if j.num_positions()
+    ]
+    found = []
+    for r in recordings:
+        columns = {"time": r.time} | {c.name: c.values for c in r.channels.values()}
+        matches = [Match(name, name) for name in columns]
+        _, said = by_content(plant, joints, columns, matches)
+        for each in said:
+            wrong = each.kind != "no_content"
+            says = each.says
+            if each.kind == "effort_factor":
+                says += (
+                    f" In the sidecar: columns: {{NAME: {{channel: {each.channel}, "
+                    f"scale: {each.size:.6g}}}}}"
+                )
+            severity = "error" if wrong else "warning"
+            found.append(
+                Finding(each.kind, r.name, each.channel, each.size, "", severity, says)
+            )
+    return found

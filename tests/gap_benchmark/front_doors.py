@@ -1,0 +1,514 @@
+"""Logs with one wrong thing each, as they come to the front door of `makebreak gap`.
+
+    python tests/gap_benchmark/front_doors.py --seed 3 --count 120
+
+A robot, an exact log of it (one joint may have friction that the model lacks), and one
+thing wrong with the log. `seen` reads, proposes and checks as `makebreak gap ROBOT LOG`
+does before it computes; a log is right where what is wrong is said by its name and the
+channels hold what the robot did: then no mass has to make up for anything.
+"""
+
+import argparse
+import re
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from pydrake.multibody.tree import MultibodyForces
+
+from makebreak.gap.data.checks import check_recordings
+from makebreak.gap.data.content import check_contents
+from makebreak.gap.data.reading import read_recordings
+from makebreak.gap.data.robot import propose_scene, read_log, read_robot
+from makebreak.gap.data.scene_facts import scene_facts
+
+RATE = 100.0
+LINK = """<link name="l{k}"><inertial><origin xyz="0 0 {c}"/><mass value="{m}"/>
+<inertia ixx="{i}" iyy="{i}" izz="{z}" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="{name}" type="{type}"><parent link="{parent}"/><child link="l{k}"/>
+<origin xyz="0 0 {z0}"/><axis xyz="{axis}"/>
+<limit lower="{low}" upper="{high}" effort="500" velocity="20"/></joint>"""
+ROBOTS = {
+    "planar": [("revolute", "0 1 0", 3.0), ("revolute", "0 1 0", 3.0)],
+    "three": [("revolute", "0 0 1", 2.9), ("revolute", "0 1 0", 2.5),
+              ("revolute", "0 1 0", 2.8)],
+    "six": [("revolute", "0 0 1", 3.1), ("revolute", "0 1 0", 3.1),
+            ("revolute", "0 1 0", 3.1), ("revolute", "0 1 0", 3.1),
+            ("revolute", "1 0 0", 3.1), ("revolute", "0 1 0", 3.1)],
+    "cart": [("prismatic", "1 0 0", 0.8), ("revolute", "0 1 0", 3.1)],
+}  # fmt: skip
+
+
+def urdf(name: str, rng) -> str:
+    links = []
+    for k, (kind, axis, limit) in enumerate(ROBOTS[name], start=1):
+        m = 3.0 * 0.7**k * rng.uniform(0.8, 1.2)
+        links.append(
+            LINK.format(
+                k=k, c=-0.12, m=m, i=m * 0.012, z=m * 0.003, name=f"joint{k}",
+                type=kind, parent="base" if k == 1 else f"l{k - 1}",
+                z0=-0.3 if k > 1 else 0.5, axis=axis, low=-limit, high=limit,
+            )
+        )  # fmt: skip
+    return f'<robot name="arm"><link name="base"/>{"".join(links)}</robot>'
+
+
+@dataclass
+class Log:
+    """What is written: names, columns (n,) and how. truth: {channel: (n,)}."""
+
+    time: np.ndarray
+    columns: dict[str, np.ndarray]
+    truth: dict[str, np.ndarray]
+    joints: int
+    limits: list[float]
+    slides: list[bool]
+    rng: np.random.Generator
+    write: Callable[[Path, dict], Path] | None = None
+
+
+def exact(name: str, folder: Path, rng) -> tuple[Path, Log]:
+    path = folder / "arm.urdf"
+    path.write_text(urdf(name, rng))
+    robot = read_robot(path)
+    n = len(robot.joints)
+    t = np.arange(0.0, 12.0, 1.0 / RATE)
+    q, v, a = (np.zeros((len(t), n)) for _ in range(3))
+    slides = [j.prismatic for j in robot.joints]
+    for i in range(n):
+        size = 0.25 if slides[i] else 0.6
+        for _ in range(3):
+            w, phase = 2.0 * np.pi * rng.uniform(0.15, 0.8), rng.uniform(0.0, 6.3)
+            s = size * rng.uniform(0.5, 1.0)
+            q[:, i] += s * np.sin(w * t + phase)
+            v[:, i] += s * w * np.cos(w * t + phase)
+            a[:, i] -= s * w * w * np.sin(w * t + phase)
+    plant, tau = robot.plant, np.zeros_like(q)
+    context, forces = plant.CreateDefaultContext(), MultibodyForces(plant)
+    for k in range(len(t)):
+        plant.SetPositions(context, q[k])
+        plant.SetVelocities(context, v[k])
+        plant.CalcForceElementsContribution(context, forces)
+        tau[k] = plant.CalcInverseDynamics(context, a[k], forces)
+    if rng.random() < 0.5:
+        i = int(rng.integers(n))
+        tau[:, i] += 0.15 * np.std(tau[:, i]) * np.sign(v[:, i])
+    truth, columns = {}, {}
+    for i in range(n):
+        noisy = (("position", q, 1e-5), ("velocity", v, 1e-3),
+                 ("effort_measured", tau, 2e-3 * np.std(tau[:, i])))  # fmt: skip
+        for what, y, noise in noisy:
+            truth[f"arm.joint{i + 1}.{what}"] = y[:, i]
+            short = what.split("_")[0]
+            columns[f"joint{i + 1}_{short}"] = y[:, i] + rng.normal(0.0, noise, len(t))
+    limits = [j.upper for j in robot.joints]
+    return path, Log(t, columns, truth, n, limits, slides, rng)
+
+
+def names(log: Log, what: str) -> list[str]:
+    return [f"joint{i + 1}_{what}" for i in range(log.joints)]
+
+
+# ----- What may be wrong: each changes a log in place, and returns words of which one
+# must be said; "" where nothing need be said as it is simply right.
+
+
+def scaled(what, factor, *words):
+    def wrong(log: Log):
+        for name in names(log, what):
+            log.columns[name] = log.columns[name] / factor
+        return words
+
+    return wrong
+
+
+def each_gear(log: Log):
+    gears = log.rng.choice([30.0, 50.0, 80.0, 100.0, 120.0], log.joints)
+    for name, gear in zip(names(log, "effort"), gears, strict=True):
+        log.columns[name] = log.columns[name] / gear
+    return ("smaller than the model needs",)
+
+
+def signs(log: Log):
+    for name in names(log, "effort"):
+        log.columns[name] = -log.columns[name]
+    return ("other sign",)
+
+
+def one_sign(log: Log):
+    name = names(log, "effort")[-1]
+    log.columns[name] = -log.columns[name]
+    return ("other sign",)
+
+
+def swapped(*whats):
+    def wrong(log: Log):
+        for what in whats:
+            a, b = names(log, what)[-2:]
+            log.columns[a], log.columns[b] = log.columns[b], log.columns[a]
+        return ("swapped",)
+
+    return wrong
+
+
+def shifted(*whats):
+    def wrong(log: Log):
+        for what in whats:
+            mine = names(log, what)
+            values = [log.columns[name] for name in mine]
+            for k, name in enumerate(mine):
+                log.columns[name] = values[(k + 1) % len(mine)]
+        return ("one off", "swapped")
+
+    return wrong
+
+
+def decoy(name, make, *words):
+    """Another column before the right one."""
+
+    def wrong(log: Log):
+        own = {}
+        for i in range(log.joints):
+            of = {w: log.columns[f"joint{i + 1}_{w}"]
+                  for w in ("position", "velocity", "effort")}  # fmt: skip
+            own[name.format(i + 1)] = make(log, of)
+        log.columns = own | log.columns
+        return words
+
+    return wrong
+
+
+def dead_command(value):
+    def wrong(log: Log):
+        for i in range(log.joints):
+            y = np.full(len(log.time), value)
+            log.columns[f"joint{i + 1}_effort_command"] = y
+        return ("throughout while", "empty", "no sample")
+
+    return wrong
+
+
+def other_effort(log: Log):
+    """A column with a good name that has nothing to do with the effort."""
+    own = {f"joint{i + 1}_torque": log.rng.normal(0.0, 1.0, len(log.time))
+           for i in range(log.joints)}  # fmt: skip
+    renamed = {k.replace("effort", "torque_sensor"): y for k, y in log.columns.items()}
+    log.columns = own | renamed
+    return ("explains",)
+
+
+def currents(log: Log):
+    gains = log.rng.uniform(0.5, 12.0, log.joints)
+    for i in range(log.joints):
+        y = log.columns.pop(f"joint{i + 1}_effort")
+        log.columns[f"joint{i + 1}_current"] = y / gains[i]
+    log.truth = {"gains": gains}
+    return ("currents",)
+
+
+def turns(log: Log):
+    i = next(k for k in range(log.joints) if not log.slides[k])
+    name = f"joint{i + 1}_position"
+    q = log.columns[name]
+    q = q + (np.pi - np.quantile(q, 0.8))
+    log.columns[name] = np.mod(q + np.pi, 2.0 * np.pi) - np.pi
+    log.truth.clear()  # Where it stands is another matter; only the jumps are judged.
+    log.truth["turns"] = np.array([i])
+    return ("whole turn",)
+
+
+def from_zero(log: Log):
+    """0 to 360 degrees of joints that count from -180."""
+    for i, name in enumerate(names(log, "position")):
+        if not log.slides[i]:
+            log.columns[name] = np.mod(np.rad2deg(log.columns[name]), 360.0)
+    return ("turn", "degrees")
+
+
+def degrees(what):
+    def wrong(log: Log):
+        for i, name in enumerate(names(log, what)):
+            if not log.slides[i]:
+                log.columns[name] = np.rad2deg(log.columns[name])
+        return ("deg",)
+
+    return wrong
+
+
+def rates(factor, *words):
+    def wrong(log: Log):
+        for i, name in enumerate(names(log, "velocity")):
+            if not log.slides[i]:
+                log.columns[name] = log.columns[name] * factor
+        return words
+
+    return wrong
+
+
+def late(what, seconds, *words):
+    def wrong(log: Log):
+        for name in names(log, what):
+            y = log.columns[name]
+            log.columns[name] = np.interp(log.time - seconds, log.time, y)
+        log.truth = {k: y for k, y in log.truth.items() if "velocity" not in k}
+        return words
+
+    return wrong
+
+
+def stamps(make, *words, key="time"):
+    def wrong(log: Log):
+        log.columns = {key: make(log)} | log.columns
+        return words
+
+    return wrong
+
+
+def pause(log: Log):
+    t = log.time.copy()
+    t[len(t) // 2 :] += 5.0
+    log.columns = {"time": t} | log.columns
+    log.truth = {}
+    return ("hole",)
+
+
+def back(log: Log):
+    t = log.time.copy()
+    t[500] = t[480]
+    log.columns = {"time": t} | log.columns
+    return ("does not increase",)
+
+
+def twice(log: Log):
+    k = np.sort(np.append(np.arange(len(log.time)), np.arange(100, 1000, 90)))
+    log.columns = {"time": log.time[k]} | {n: y[k] for n, y in log.columns.items()}
+    log.truth = {}
+    return ("row before once more",)
+
+
+def iso(log: Log):
+    start = np.datetime64("2026-11-27T22:00:00", "us")
+    stamps = start + np.rint(1e6 * log.time).astype("timedelta64[us]")
+    text = [str(s).replace("T", " ") for s in stamps]
+
+    def write(folder: Path, columns: dict) -> Path:
+        path = folder / "log.csv"
+        table = np.stack(list(columns.values()), axis=1)
+        rows = [",".join([s, *(f"{x:.9g}" for x in row)])
+                for s, row in zip(text, table, strict=True)]  # fmt: skip
+        path.write_text("\n".join([",".join(["timestamp", *columns]), *rows]) + "\n")
+        return path
+
+    log.write = write
+    return ("time",)
+
+
+def semicolons(log: Log):
+    def write(folder: Path, columns: dict) -> Path:
+        path = folder / "log.csv"
+        rows = [";".join(f"{x:.9g}".replace(".", ",") for x in row)
+                for row in zip(*columns.values(), strict=True)]  # fmt: skip
+        path.write_text("\n".join([";".join(columns), *rows]) + "\n")
+        return path
+
+    log.columns = {"time": log.time} | log.columns
+    log.write = write
+    return ("",)
+
+
+def noisy_column(name, value, *words):
+    def wrong(log: Log):
+        own = {name.format(i + 1): value + log.rng.normal(0.0, 0.01, len(log.time))
+               for i in range(log.joints)}  # fmt: skip
+        log.columns = own | log.columns
+        return words
+
+    return wrong
+
+
+def missing_effort(log: Log):
+    name = names(log, "effort")[-1]
+    del log.columns[name]
+    log.truth = {k: y for k, y in log.truth.items()
+                 if not k.startswith(f"arm.joint{log.joints}.effort")}  # fmt: skip
+    return ("effort",)
+
+
+def empty_velocity(log: Log):
+    name = names(log, "velocity")[0]
+    log.columns[name] = np.full(len(log.time), np.nan)
+    log.truth.pop("arm.joint1.velocity")
+    return ("no sample",)
+
+
+def noise(log, of):
+    return 0.1 * np.std(of["effort"]) * log.rng.normal(size=len(log.time))
+
+
+KINDS = {
+    "effort in N mm": scaled("effort", 1e-3, "N mm"),
+    "effort in N cm": scaled("effort", 1e-2, "N cm"),
+    "effort in kN m": scaled("effort", 1e3, "kN m"),
+    "effort in kgf cm": scaled("effort", 0.0980665, "kgf cm"),
+    "effort before one gear": scaled("effort", 50.0, "smaller than the model needs"),
+    "effort before gears": each_gear,
+    "effort with a constant": scaled("effort", 3.7, "smaller than the model needs"),
+    "effort of other sign": signs,
+    "one effort of other sign": one_sign,
+    "two efforts swapped": swapped("effort"),
+    "efforts one off": shifted("effort"),
+    "two velocities swapped": swapped("velocity"),
+    "velocities one off": shifted("velocity"),
+    "two positions swapped": swapped("position"),
+    "external torque first": decoy("joint{}_torque_external", noise, "external"),
+    "gravity first": decoy(
+        "joint{}_tau_gravity", lambda log, of: 0.7 * of["effort"], "gravity"
+    ),
+    "feedforward first": decoy(
+        "joint{}_torque_ff", lambda log, of: 0.8 * of["effort"], "ff"
+    ),
+    "error first": decoy("joint{}_position_error", noise, "position_error"),
+    "lower limits first": noisy_column("joint{}_position_min", -2.0, "position_min"),
+    "temperatures first": noisy_column("joint{}_temperature", 35.0, "temperature"),
+    "motor position first": decoy(
+        "motor_position_joint{}",
+        lambda log, of: 100.0 * of["position"],
+        "is another column",
+    ),
+    "raw position first": decoy(
+        "joint{}_position_raw",
+        lambda log, of: 651.9 * of["position"] + 2048.0,
+        "is another column",
+    ),
+    "command of zeros": dead_command(0.0),
+    "command that stays": dead_command(1.7),
+    "command that is empty": dead_command(np.nan),
+    "effort that is none": other_effort,
+    "currents alone": currents,
+    "effort missing at one joint": missing_effort,
+    "velocity that is empty": empty_velocity,
+    "position jumps by a turn": turns,
+    "positions from 0 to 360": from_zero,
+    "positions in degrees": degrees("position"),
+    "velocities in degrees": rates(180.0 / np.pi, "deg/s"),
+    "velocities in rpm": rates(60.0 / (2.0 * np.pi), "rpm"),
+    "velocities of other sign": rates(-1.0, "other sign"),
+    "velocities late": late("velocity", 0.02, "after position"),
+    "time in ns": stamps(lambda log: 1.7e18 + np.rint(1e9 * log.time), "as ns"),
+    "time in us": stamps(lambda log: np.rint(1e6 * log.time), "as us", key="utime"),
+    "time in ms": stamps(lambda log: 1e3 * log.time, "as ms"),
+    "time as text": iso,
+    "a pause": pause,
+    "a stamp that steps back": back,
+    "rows twice": twice,
+    "semicolons and commas": semicolons,
+}
+
+
+@dataclass(frozen=True)
+class Seen:
+    """words: all that is said. refused: it is an error of one line. right: whether all
+    channels are what they were."""
+
+    words: str
+    refused: bool
+    right: bool
+
+
+def seen(robot_path: Path, log_path: Path, log: Log) -> Seen:
+    try:
+        robot, read = read_robot(robot_path), read_log(log_path)
+        proposal = propose_scene(robot, [read])
+        sidecars = {}
+        for path, text in proposal.sidecars.items():
+            sidecars[path] = path.with_name("proposed.yaml")
+            sidecars[path].write_text(text)
+        recordings = read_recordings([log_path], sidecars=sidecars)
+    except ValueError as error:
+        told = str(error)
+        gains = log.truth.get("gains")
+        right = "does not increase" in told
+        if gains is not None:
+            each = re.findall(r"_current: ([\d.]+)", told)
+            right = len(each) == len(gains) and np.allclose(
+                np.array(each, float), gains, rtol=0.05
+            )
+        return Seen(told, True, right)
+    findings = [*proposal.findings(),
+                *check_recordings(recordings, scene_facts(robot.plant)),
+                *check_contents(robot.plant, recordings)]  # fmt: skip
+    words = [*(f"{f.kind} {f.says}" for f in findings), *proposal.notes,
+             *proposal.sidecars.values(), proposal.scene]  # fmt: skip
+    (recording,) = recordings
+    errors = [f for f in findings if f.severity == "error"]
+    right = not errors
+    for name, true in log.truth.items():
+        if name == "turns":
+            q = recording[f"arm.joint{true[0] + 1}.position"]
+            right &= bool(np.abs(np.diff(q)).max() < 1.0)
+            continue
+        if name not in recording:
+            right = False
+            continue
+        mine = recording[name]
+        if len(mine) != len(true):
+            right = False
+            continue
+        # A factor's digits are those that the data tell; friction is what it is.
+        scale = np.std(true) or 1.0
+        turn = 0.0
+        if name.endswith(".position"):
+            turn = np.round(np.median(true - mine) / (2 * np.pi)) * 2 * np.pi
+        right &= bool(np.sqrt(np.mean((mine + turn - true) ** 2)) < 0.06 * scale)
+    return Seen("\n".join(words), False, right)
+
+
+def one(kind: str, robot: str, seed: int, folder: Path) -> tuple[bool, bool, Seen]:
+    """Whether what is wrong was said, whether the channels are right, and all."""
+    rng = np.random.default_rng(seed)
+    path, log = exact(robot, folder, rng)
+    words = KINDS[kind](log)
+    if log.write is None:
+        if not any(key in log.columns for key in ("time", "utime")):
+            log.columns = {"time": log.time} | log.columns
+        file = folder / "log.csv"
+        rows = [",".join("" if x != x else f"{x:.12g}" if k else repr(float(x))
+                         for k, x in enumerate(row))
+                for row in zip(*log.columns.values(), strict=True)]  # fmt: skip
+        file.write_text("\n".join([",".join(log.columns), *rows]) + "\n")
+    else:
+        file = log.write(folder, log.columns)
+    found = seen(path, file, log)
+    return any(word in found.words for word in words), found.right, found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--count", type=int, default=120)
+    args = parser.parse_args()
+    rng = np.random.default_rng(args.seed)
+    kinds = list(KINDS)
+    good, n = [0, 0], 0
+    for k in range(args.count):
+        kind = kinds[k % len(kinds)]
+        robot = list(ROBOTS)[int(rng.integers(len(ROBOTS)))]
+        seed = int(rng.integers(1 << 30))
+        with tempfile.TemporaryDirectory() as folder:
+            try:
+                said, right, found = one(kind, robot, seed, Path(folder))
+            except Exception as error:  # A crash is what is looked for.
+                said, right = False, False
+                found = Seen(f"CRASH {error!r}", True, False)
+        n, good = n + 1, [good[0] + said, good[1] + right]
+        if not (said and right):
+            text = " ".join(found.words.split())[:400] if found.refused else ""
+            print(f"{kind} | {robot} {seed} | said {said} right {right} {text}")
+    print(f"{n} logs: said {good[0]}, channels right {good[1]}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,94 @@
+"""Logs with one wrong thing each: it is said, and no mass has to make up for it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from gap_benchmark.front_doors import KINDS, ROBOTS, exact, one
+
+from makebreak.gap.data.content import check_contents, likeness
+from makebreak.gap.data.reading import read_recording
+from makebreak.gap.data.robot import read_robot
+from makebreak.gap.data.table import write_recording
+from makebreak.gap.data.turns import without_turns
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_wrong_with_a_log_is_said_and_put_right(tmp_path, kind):
+    """The channels that are read are those of the motion that the log was made of."""
+    robot = list(ROBOTS)[len(kind) % len(ROBOTS)]
+    said, right, found = one(kind, robot, 11, tmp_path)
+    assert said, found.words
+    assert right, found.words
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("seed", [1, 2])
+def test_of_a_log_that_is_right_nothing_is_said(tmp_path, robot, seed):
+    _, right, found = one("semicolons and commas", robot, seed, tmp_path)
+    assert right
+    told = {line.split(" ", 1)[0] for line in found.words.splitlines()}
+    wrong = ("effort_factor", "effort_sign", "columns_swapped", "columns_shifted",
+             "columns_mixed", "no_content", "position_turns")  # fmt: skip
+    assert not told & {*wrong}
+
+
+def scene_log(tmp_path, factor):
+    """A recording under our names whose efforts are `factor` times the true ones."""
+    path, log = exact("three", tmp_path, np.random.default_rng(5))
+    columns = {"time": log.time} | {
+        name: y * (factor if name.endswith("effort_measured") else 1.0)
+        for name, y in log.truth.items()
+    }
+    write_recording(tmp_path / "log.csv", columns)
+    return read_robot(path).plant, read_recording(tmp_path / "log.csv")
+
+
+def test_efforts_before_a_gear_are_an_error_beside_a_scene_too(tmp_path):
+    """As an error: nothing is named until the sidecar has the factor."""
+    plant, recording = scene_log(tmp_path, 1.0 / 80.0)
+    (finding,) = check_contents(plant, [recording])
+    assert (finding.kind, finding.severity) == ("effort_factor", "error")
+    assert finding.size == pytest.approx(80.0)
+    assert "scale: 80}" in finding.says
+
+
+@pytest.mark.parametrize("factor", [0.7, 1.0, 1.4])
+def test_a_gain_that_the_search_can_name_is_left_to_it(tmp_path, factor):
+    plant, recording = scene_log(tmp_path, factor)
+    assert check_contents(plant, [recording]) == []
+
+
+def test_a_rotor_that_the_model_lacks_is_no_factor(tmp_path):
+    """A geared motor's own inertia makes efforts several times larger."""
+    plant, recording = scene_log(tmp_path, 1.0)
+    channels = dict(recording.channels)
+    for i in range(1, 4):
+        name = f"arm.joint{i}.effort_measured"
+        speed = recording[f"arm.joint{i}.velocity"]
+        rotor = 0.5 * np.gradient(speed, recording.time)
+        channels[name] = replace(channels[name], values=channels[name].values + rotor)
+    found = check_contents(plant, [replace(recording, channels=channels)])
+    assert [f.kind for f in found] == []
+
+
+def test_the_factor_is_that_of_least_squares_with_friction_free():
+    """predicted = 3 column + 2 + 0.5 sign(v), with noise in neither."""
+    t = np.linspace(0.0, 10.0, 500)
+    v, column = np.cos(2.0 * t), np.sin(3.0 * t) + 0.2 * np.sign(np.cos(2.0 * t))
+    predicted = 3.0 * column + 2.0 + 0.5 * np.sign(v)
+    rest = np.stack([np.ones_like(v), v, np.sign(v)], axis=1)
+    found = likeness(predicted, column, rest)
+    np.testing.assert_allclose([found.factor, found.explained], [3.0, 1.0], atol=1e-9)
+
+
+def test_turns_are_undone_and_fast_motion_is_left_alone():
+    t = np.linspace(0.0, 10.0, 1000)
+    q = 5.0 * np.sin(t)
+    wrapped = np.mod(q + np.pi, 2.0 * np.pi) - np.pi
+    back, n = without_turns(wrapped)
+    # Up through pi, down through it and -pi, up again, and half of that once more.
+    assert n == np.sum(np.abs(np.diff(wrapped)) > np.pi)
+    np.testing.assert_allclose(back, q, atol=1e-12)
+    steps = 3.0 * np.arange(50.0) % 7.0
+    assert without_turns(steps)[1] == 0
