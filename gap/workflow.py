@@ -421,6 +421,8 @@ def conclude(
         for c in selection.choices
     ]
     selection = replace(selection, choices=tuple(choices))
+    # Of what is tried, too: what changes may fail on data from another time.
+    drifting = drift_sentences(problem, selection.end) if choices else ""
 
     def facts_of(some: Selection, outcome: Outcome | None) -> Facts:
         return Facts(
@@ -471,7 +473,7 @@ def conclude(
     near += _says_failure(final.gap)
     if verdict != "gap_unnamed" or not shows_in_equations_alone(final.gap):
         near += two_figures(facts.start, facts.end, final.gap, problem.by_equations)
-    near += drift_sentences(problem, selection.end) if selection.choices else ""
+    near += drifting
     # Nothing was learned from it: the part that is reported on is looked at last.
     where = [] if verdict in AGREES else [
         *problem.where(selection.start.left),
