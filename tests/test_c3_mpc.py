@@ -16,7 +16,6 @@ from pydrake.systems.framework import DiagramBuilder
 from scipy.optimize import linprog, minimize
 from scipy.spatial.transform import Rotation
 
-from makebreak import model_path
 from makebreak.scripts.bench_c3 import (
     OsqpC3,
     ball,
@@ -1576,32 +1575,6 @@ def test_the_system_holds_the_modes_of_its_last_plan():
     np.testing.assert_allclose(read(simulator, "plan").u, expected.u, atol=1e-12)
     with pytest.raises(ValueError, match="fixed_knots is 6, expected an .* N = 5"):
         C3Mpc(C3Config(weights, options=p.options, fixed_knots=6), 0.05)
-
-
-def test_a_bound_is_not_met_by_pulling():
-    """A finger pushes the puck and does not pull: a bound that asks for that has no
-    plan."""
-    builder = DiagramBuilder()
-    plant, _ = AddMultibodyPlantSceneGraph(builder, 0.0)
-    Parser(plant).AddModels(model_path("puck.sdf"))
-    plant.Finalize()
-    pair = ContactPair("finger", "puck", 0.3)
-    model = AnitescuLcs(builder.Build(), [pair], dt_sec=0.05)
-    lcs = model.build(model.x_default, np.zeros(model.n_u))
-    goal = np.tile([0.4, 0.5, 0.0, 0.0], (21, 1))
-    ones = np.ones(lcs.n_x + 2 * lcs.n_lam + lcs.n_u)
-    weights = C3Weights(np.diag([0, 200, 1, 20.0]), 0.01 * np.eye(1), ones, ones)
-
-    def plan(**bounds):
-        problem = C3Problem(
-            weights, PLUS, C3Options(N=20, rounds=5), C3Bounds(**bounds)
-        )
-        return solve_c3(lcs, model.x_default, goal, problem)[0]
-
-    with pytest.raises(C3Failure, match="no plan meets the bounds"):
-        plan(x_upper=np.array([np.inf, np.inf, np.inf, -0.02]))
-    forward = plan(x_upper=np.array([np.inf, np.inf, np.inf, 0.05]))
-    assert forward.lam.min() >= -1e-9 and forward.x[1:, 3].max() <= 0.05 + 1e-6
 
 
 def test_bounds_of_inputs_alone_are_never_called_impossible():

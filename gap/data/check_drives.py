@@ -60,15 +60,18 @@ def check_drives(recording: Recording, scene: Scene) -> None:
 
 def untold_joints(scene: Scene, recordings: Sequence[Recording]) -> list[str]:
     """Joints that the scene drives by efforts, and of which a recording has neither a
-    command nor a measured effort: what drives them is not known."""
+    command nor a measured effort, as it has of others: what drives them is not known.
+    (Where it has none at all, no torque acts.)"""
     if "effort_command" not in COMMANDS_OF[scene.actuation.type]:
         return []
     told = ("effort_command", "effort_measured")
-    return [
+    joints = scene.actuation.joints
+    untold = [
         joint
-        for joint in scene.actuation.joints
+        for joint in joints
         if any(not any(f"{joint}.{what}" in r for what in told) for r in recordings)
     ]
+    return untold if len(untold) < len(joints) else []
 
 
 def check_untold(scene: Scene, recordings: Sequence[Recording]) -> list[Finding]:

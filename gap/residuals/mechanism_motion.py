@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from makebreak.gap.data.check_drives import untold_joints
 from makebreak.gap.data.recording import Recording
 from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.residuals.track import Track, track_of
@@ -142,15 +143,8 @@ class MechanismMotion:
             )
         ]
         # What drives a joint that has a drive is not zero where no column says it.
-        self.untold = np.array(
-            [
-                joint in scene.actuation.joints and not (commanded or measured)
-                for joint, commanded, measured in zip(
-                    self.joints, self.commanded, self.has["effort_measured"],
-                    strict=True,
-                )
-            ]
-        )  # fmt: skip
+        untold = untold_joints(scene, recordings)
+        self.untold = np.array([joint in untold for joint in self.joints])
         # What turns the rotor is in no torque that is measured at the link.
         self._link_rotor = np.array(
             [rotor_before(scene, self.dynamics.plant, joint) for joint in self.joints]

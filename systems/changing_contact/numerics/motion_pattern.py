@@ -151,7 +151,7 @@ class MotionPattern:
         base, quaternion wxyz from which rotation vectors are taken, None: the first
         orientation (it matters only where two patterns are to be blended).
     Raises: ValueError that names the segment: times that are not in order, a gap to the
-        one before, too little time for its length, or for its bends.
+        one before, too little time for its length.
     """
 
     segments: tuple[Segment, ...]
@@ -213,13 +213,6 @@ class MotionPattern:
             except ValueError as error:
                 raise ValueError(f"segment {k}: {error}") from None
             table[head + SPEED] = speed
-            bend = _largest_curvature(table, k)
-            if bend * speed**2 > a * (1.0 + 1e-9):
-                raise ValueError(
-                    f"segment {k}: a bend of radius {1.0 / bend:.3g} m at {speed:.3g} "
-                    f"m/s takes {bend * speed**2:.3g} m/s2, expected at most "
-                    f"acceleration_max, {a:.4g}: more time, or a rounder corner"
-                )
             before = speed if table[head + GOES_ON] else 0.0
         table.setflags(write=False)
         base = base.copy()

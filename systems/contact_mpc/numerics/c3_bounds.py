@@ -16,13 +16,11 @@ from makebreak.systems.contact_mpc.numerics.c3_qp import solve
 
 
 @njit(cache=True)
-def within(x, v, lower, upper, n_lam=0):
-    """Whether u and x of all knots but x_0 obey lower and upper ((n,), over [v, x]);
-    the first n_lam of v, contact forces, are not asked: theirs count where others bind.
-    """
+def within(x, v, lower, upper):
+    """Whether u and x of all knots but x_0 obey lower and upper ((n,), over [v, x])."""
     n_v = v.shape[1]
     for k in range(v.shape[0]):
-        for i in range(n_lam, n_v):
+        for i in range(n_v):
             if not lower[i] <= v[k, i] <= upper[i]:
                 return False
         for i in range(x.shape[1]):

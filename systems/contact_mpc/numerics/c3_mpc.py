@@ -150,10 +150,6 @@ class C3Problem:
         self.n_lam = n_contact // 2 if self.is_plus else n_contact
         self._check_consensus_weights(n_contact)
         bounds = C3Bounds() if bounds is None else bounds
-        self._bounds_states = any(
-            x is not None and np.isfinite(np.asarray(x, float)).any()
-            for x in (bounds.x_lower, bounds.x_upper)
-        )
         self.lower = self._bound(-np.inf, u=bounds.u_lower, x=bounds.x_lower)
         self.upper = self._bound(np.inf, u=bounds.u_upper, x=bounds.x_upper)
         for i in np.flatnonzero(~(self.lower <= self.upper)):
@@ -214,11 +210,8 @@ class C3Problem:
             )
 
     def _bound(self, unbounded, u, x):
-        """A bound over [lam, u, x]; of lam where states have one: no plan keeps that by
-        pulling. (Else the projection keeps lam.)"""
+        """A bound over [lam, u, x]; lam has none here (the projection keeps it)."""
         parts = [np.full(self.n_lam, unbounded)]
-        if unbounded < 0.0 and self._bounds_states:
-            parts[0][:] = 0.0
         for name, value, n in (("u", u, self.n_u), ("x", x, self.n_x)):
             part = np.full(n, unbounded) if value is None else np.asarray(value, float)
             if part.shape != (n,) or np.isnan(part).any():
