@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from gap_benchmark.front_doors import KINDS, ROBOTS, exact, one
+from front_doors import KINDS, ROBOTS, exact, one
 
 from makebreak.gap.data.content import check_contents, likeness
 from makebreak.gap.data.reading import read_recording

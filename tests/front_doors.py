@@ -1,6 +1,6 @@
 """Logs with one wrong thing each, as they come to the front door of `makebreak gap`.
 
-    python tests/gap_benchmark/front_doors.py --seed 3 --count 120
+    python tests/front_doors.py --seed 3 --count 120
 
 A robot, an exact log of it (one joint may have friction that the model lacks), and one
 thing wrong with the log. `seen` reads, proposes and checks as `makebreak gap ROBOT LOG`
