@@ -45,21 +45,31 @@ class Confirmed:
     vetoed: tuple[Veto, ...] = ()
 
 
-def confirmed(
-    problem: GapProblem,
-    selection: Selection,
-    reported: Sequence[Recording],
-    jobs: int = 1,
-) -> Confirmed:
-    """The effects of a selection that the held-out recordings do not veto."""
+def judge_of(
+    problem: GapProblem, reported: Sequence[Recording], jobs: int = 1
+) -> Judge:
+    """What held-out recordings say of a selection, each of which is simulated once;
+    None where they hold nothing to compare."""
+    known: dict[tuple, Outcome | None] = {}
 
     def judge(some: Selection) -> Outcome | None:
         if not reported:
             return None
-        return problem.outcome(
-            some.effects(), some.start, some.end, some.nuisances, reported, jobs
-        )
+        key = (
+            tuple(e.key for e in some.effects()),
+            some.start.b.tobytes(), some.end.b.tobytes(),
+        )  # fmt: skip
+        if key not in known:
+            known[key] = problem.outcome(
+                some.effects(), some.start, some.end, some.nuisances, reported, jobs
+            )
+        return known[key]
 
+    return judge
+
+
+def confirmed(problem: GapProblem, selection: Selection, judge: Judge) -> Confirmed:
+    """The effects of a selection that the held-out recordings do not veto."""
     vetoed: list[Veto] = []
     outcome = judge(selection)
     while selection.choices and outcome is not None:
@@ -172,10 +182,7 @@ def _worse_places(gap: GapMeasure) -> list[tuple[str, str, bool]]:
     worse after than before."""
     found = []
     for place, channels in _channels_of(gap).items():
-        a, b = (
-            float(np.sqrt(np.mean([gap.per_channel[c][when] ** 2 for c in channels])))
-            for when in ("before", "after")
-        )
+        a, b = (_error_of(gap, channels, when) for when in ("before", "after"))
         if is_worse(a, b, _squares(gap, channels)):
             why = (
                 f"With it the simulated error at {place} goes from {figure(a)} to "
@@ -214,9 +221,11 @@ def _is_worse_than(alone: GapMeasure, gap: GapMeasure, place: str) -> bool:
 def _error_at(gap: GapMeasure, place: str) -> float:
     if place == WHOLE:
         return gap.after
-    squares = [
-        gap.per_channel[c]["after"] ** 2 for c in _channels_of(gap).get(place, ())
-    ]
+    return _error_of(gap, _channels_of(gap).get(place, ()), "after")
+
+
+def _error_of(gap: GapMeasure, channels: Sequence[str], when: str) -> float:
+    squares = [gap.per_channel[c][when] ** 2 for c in channels]
     return float(np.sqrt(np.mean(squares))) if squares else 0.0
 
 

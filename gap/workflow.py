@@ -23,7 +23,7 @@ from makebreak.gap.by_recording import (
     may_differ,
     with_differences,
 )
-from makebreak.gap.confirm import Veto, confirmed
+from makebreak.gap.confirm import Veto, confirmed, judge_of
 from makebreak.gap.data import sampled_commands
 from makebreak.gap.data.channel_noise import in_newton_metres
 from makebreak.gap.data.check_drives import (
@@ -431,6 +431,7 @@ def conclude(
             loud_max=problem.plan.loud, asks_simulation=problem.plan.simulation_agrees,
         )  # fmt: skip
 
+    judge = judge_of(problem, reported, jobs)
     vetoed: list[Veto] = []
     outcome: Outcome | None = None
     while True:
@@ -439,7 +440,7 @@ def conclude(
             vetoed += [(choice, why) for choice in selection.choices]
             selection = without(problem, selection, *selection.effects())
         else:
-            found = confirmed(problem, selection, reported, jobs)
+            found = confirmed(problem, selection, judge)
             outcome, vetoed = found.outcome, [*vetoed, *found.vetoed]
             if outcome is None and found.selection.choices:
                 vetoed += [(c, _TOO_SHORT_TO_REPORT) for c in selection.choices]

@@ -1,18 +1,19 @@
 """What data held out for the report do to the effects that a search has chosen."""
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from test_gap_forward import Columns, directions
 
-from makebreak.gap.confirm import acts_on, confirmed, is_worse
+from makebreak.gap.confirm import acts_on, confirmed, is_worse, judge_of
 from makebreak.gap.fit import fit_effects
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Outcome
 from makebreak.gap.result import GapMeasure, InUnits
 from makebreak.gap.search.choice import Choice, Selection
-from makebreak.gap.verdict import Facts, decide
+from makebreak.gap.verdict import Facts, decide, too_weak
 from makebreak.models.effects.kind import Effect
 
 KIND, JOINTS = "joint_coulomb_friction", ("arm.j1", "arm.j2", "arm.j3")
@@ -59,12 +60,29 @@ def selection_of(problem: Held, joints=JOINTS, **more) -> Selection:
     return Selection(choices, start, end, none)
 
 
+def confirm(problem: Held, selection: Selection):
+    return confirmed(problem, selection, judge_of(problem, ["held out"]))
+
+
+def test_a_selection_is_simulated_once_however_often_it_is_asked_for():
+    """A run asks again after each veto; a simulation takes most of its time."""
+    problem = Held({"arm.j1": (9.0, 1.0), "arm.j2": (4.8, 8.6), "arm.j3": (9.0, 1.0)})
+    judge = judge_of(problem, ["held out"])
+    found = confirmed(problem, selection_of(problem), judge)
+    calls = problem.calls
+    again = confirmed(problem, found.selection, judge)
+    assert again.outcome is found.outcome and problem.calls == calls
+    fewer = replace(found.selection, choices=found.selection.choices[:1])
+    assert judge(fewer).gap.after > found.outcome.gap.after
+    assert problem.calls == calls + 1
+
+
 @pytest.mark.parametrize("seed", range(30))
 def test_what_stays_makes_held_out_data_no_worse_as_a_whole_and_at_each_joint(seed):
     rng = np.random.default_rng(seed)
     shown = {j: tuple(np.exp(rng.uniform(0.0, 3.0, 2))) for j in JOINTS}
     problem = Held(shown)
-    found = confirmed(problem, selection_of(problem), ["held out"])
+    found = confirm(problem, selection_of(problem))
     gap, stays = found.outcome.gap, found.selection.effects()
     # The figures are those of what stays, and nothing is lost on the way.
     again = problem.outcome(stays, None, None, None)
@@ -84,7 +102,7 @@ def test_what_stays_makes_held_out_data_no_worse_as_a_whole_and_at_each_joint(se
 
 def test_one_joint_of_a_group_goes_and_the_others_stay():
     problem = Held({"arm.j1": (9.0, 1.0), "arm.j2": (4.8, 8.6), "arm.j3": (9.0, 1.0)})
-    found = confirmed(problem, selection_of(problem), ["held out"])
+    found = confirm(problem, selection_of(problem))
     assert [e.at for e in found.selection.effects()] == [["arm.j1"], ["arm.j3"]]
     ((choice, why),) = found.vetoed
     assert choice.effect.at == ["arm.j2"] and "from 4.8 to 8.6" in why
@@ -103,7 +121,7 @@ def test_a_joint_s_own_equation_vetoes_too():
     problem = WithEquations(
         {"arm.j1": (9.0, 1.0), "arm.j2": (2.0, 1.9), "arm.j3": (9.0, 1.0)}
     )
-    found = confirmed(problem, selection_of(problem), ["held out"])
+    found = confirm(problem, selection_of(problem))
     ((choice, why),) = found.vetoed
     assert choice.effect.at == ["arm.j2"] and "4.8 to 8.6 N m" in why
 
@@ -115,7 +133,7 @@ def test_a_tie_that_leaves_the_gap_in_simulation_is_none(with_tie, kept):
     selection = selection_of(problem, JOINTS[:1])
     (choice,) = selection.choices
     tied = replace(selection, choices=(replace(choice, ties=(tie,)),))
-    (choice,) = confirmed(problem, tied, ["held out"]).selection.choices
+    (choice,) = confirm(problem, tied).selection.choices
     assert bool(choice.ties) == kept
 
 
@@ -126,6 +144,13 @@ def test_a_little_more_in_every_window_is_worse_and_in_some_is_chance():
     maybe += np.mean(before) + 0.1 - np.mean(maybe)
     assert is_worse(2.0, 2.02, np.stack([before, surely]))
     assert not is_worse(2.0, 2.02, np.stack([before, maybe]))
+    few = np.stack([before, surely + 0.01 * rng.normal(size=40)])
+    assert is_worse(2.0, 2.02, few[:, :5]) and not is_worse(2.0, 2.02, few[:, :2])
+    # Two windows, or copies of one, have no scatter to set a difference beside.
+    assert not is_worse(2.0, 2.02, np.array([[4.0, 4.0], [4.08, 4.08001]]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert not is_worse(2.0, 2.02, np.array([[4.0] * 9, [4.08] * 9]))
     assert is_worse(2.0, 2.2)
     assert not is_worse(0.6, 1.1)  # What a right model may leave.
 
@@ -145,3 +170,22 @@ def test_a_simulation_that_stopped_is_no_evidence():
     facts = Facts((), 1.0, 1.0, chosen_on=stopped, asks_simulation=True)
     assert decide(facts)[0] == "not_judged"
     assert decide(replace(facts, asks_simulation=False))[0] == "no_gap"
+
+
+@pytest.mark.parametrize(
+    ("in_simulation", "in_equations", "why"),
+    [
+        (0.3, 0.9, "It closes 30% of the gap, too little to be named."),
+        (0.9, 0.3, "It closes 30% of the gap, too little to be named."),
+        (0.9, 0.9, ""),
+    ],
+)
+def test_half_of_the_gap_must_be_closed_in_simulation_and_in_equations(
+    in_simulation, in_equations, why
+):
+    effect = Effect(KIND, ["arm.j1"], {"coulomb": 4.0})
+    choice = Choice(effect, {}, 9.0, 1.0, "", 1.0, (), (), 1)
+    shown = GapMeasure(11.0, 11.0 - 10.0 * in_simulation, 1.0, 0.3)
+    facts = Facts((choice,), 11.0, 8.0, far=True, chosen_on=shown)
+    assert decide(facts)[0] == "gap_unnamed"
+    assert too_weak(facts, in_equations) == why
