@@ -7,8 +7,10 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import Simulator
 
 from makebreak.gap import run_gap
+from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.data.robot import propose_scene, read_log, read_robot
 from makebreak.gap.data.table import write_recording
+from makebreak.gap.residuals.inverse import InverseModel
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.scene import read_scene
 
@@ -104,3 +106,22 @@ def test_a_joint_that_nothing_drives_is_left_passive(tmp_path):
         port.FixValue(context, [torque[k], 0.0])
     recorded(tmp_path, q, v, {0: torque})
     assert proposed(tmp_path).actuation.joints == ["arm.j1"]
+
+
+def test_an_equation_whose_effort_is_not_told_says_nothing_of_others_neither(tmp_path):
+    """The first joint's rows are 0; the second one's are what it leaves over its own
+    noise, although both have the noise of the same accelerations."""
+    q, v, vd = swings()
+    (tmp_path / "arm.urdf").write_text(URDF)
+    recorded(tmp_path, q, v, {1: 0.0 * T})
+    effort = SceneDynamics(proposed(tmp_path)).inverse_dynamics(q, v, vd)
+    recorded(tmp_path, q, v, {1: effort[:, 1] + 0.3 * np.sign(v[:, 1])})
+    scene = proposed(tmp_path)
+    assert scene.actuation.joints == ["arm.j1", "arm.j2"]
+    model = InverseModel(scene, read_recordings([tmp_path / "log.csv"]))
+    assert model.names()[:2] == [("effort", "arm.j1"), ("effort", "arm.j2")]
+    first, second = model.base().reshape(-1, len(model.names())).T[:2]
+    assert not first.any()
+    left = model.in_units(model.base())[:, 1]
+    assert np.abs(left).max() > 0.2  # [N m], the friction.
+    np.testing.assert_allclose(second, left / model.noise_in_units()[:, 1], rtol=1e-9)

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from pydrake.multibody.plant import MultibodyPlant
 
 from makebreak.gap.data.check_drives import untold_joints
 from makebreak.gap.data.recording import Episode, Recording
@@ -348,6 +349,9 @@ class WindowModel(WindowedResidual):
         key = (*late.values(), *(e.key for e in effects if self._untold))
         if key in self._commands:
             return self._commands[key]
+        dynamics = None
+        if self._untold:
+            dynamics = SceneDynamics(replace(self.scene, effects=list(effects)))
         out = []
         for i, recording in enumerate(self.recordings):
             names = self._commanded(recording)
@@ -359,8 +363,9 @@ class WindowModel(WindowedResidual):
                     time, columns = self._given(recording, episode, i, late)
                 else:
                     time = time + self.commands_late
-                if self._untold:
-                    columns |= self._needed(episode, i, effects, time)
+                if dynamics is not None:
+                    path = self._paths[i, episode.first]
+                    columns |= self._untold_efforts(dynamics, path, time)
                 of[episode.first] = Commands(time, columns)
             out.append(of)
         self._commands[key] = out
@@ -396,33 +401,25 @@ class WindowModel(WindowedResidual):
             columns[f"{joint}.effort_command"] = y
         return time, columns
 
-    def _needed(self, episode: Episode, i: int, effects, time) -> dict[str, np.ndarray]:
-        """{effort_command: (n,) [N m]} of joints whose efforts are not told: what the
-        scene with these effects needs to move as was measured."""
-        scene = replace(self.scene, effects=list(effects))
-        dynamics = SceneDynamics(scene)
-        plant, path = dynamics.plant, self._paths[i, episode.first]
-        moving = {
-            full_name(plant, j): j.velocity_start()
-            for j in one_dof_joints(plant)
-            if j.num_velocities()
-        }
-        if len(moving) != plant.num_velocities() or not moving.keys() <= set(
-            self.joints
-        ):
+    def _untold_efforts(self, dynamics, path, time) -> dict[str, np.ndarray]:
+        """{effort_command: (n,) [N m]} of joints whose efforts are not told: what a
+        scene needs to move along a path as was measured."""
+        joints = _velocity_starts(dynamics.plant)
+        n = dynamics.plant.num_velocities()
+        if len(joints) != n or not joints.keys() <= set(self.joints):
             raise DoesNotFit(
                 f"what drives {', '.join(self._untold)} is not recorded, and not all "
                 "that moves with it is measured"
             )
         middle = time + 0.5 * np.diff(time, append=time[-1])
-        motion = np.zeros((3, len(time), len(moving)))
-        for joint, k in moving.items():
+        motion = np.zeros((3, len(time), n))
+        for joint, k in joints.items():
             for of, x in zip(motion, path[f"{joint}.position"].T, strict=True):
                 of[:, k] = np.interp(middle, path["time"], x)
         q, v, vd = motion
         effort = dynamics.inverse_dynamics(q, v, vd, middle)
         return {
-            f"{joint}.effort_command": effort[:, moving[joint]]
+            f"{joint}.effort_command": effort[:, joints[joint]]
             for joint in self._untold
         }
 
@@ -435,11 +432,7 @@ class WindowModel(WindowedResidual):
         load, turns a small error into a large one. Empty where the scene has drives
         that act against errors, free bodies, or joints that were not measured."""
         plant = self.dynamics.plant
-        joints = {
-            full_name(plant, j): j.velocity_start()
-            for j in one_dof_joints(plant)
-            if j.num_velocities()
-        }
+        joints = _velocity_starts(plant)
         n = plant.num_velocities()
         if not (
             self.scene.actuation.type in ("effort", "none")
@@ -674,6 +667,15 @@ class WindowModel(WindowedResidual):
             e = (seen_in(self, w) - y) / size if len(y) else y
             out.append(np.where(np.isnan(e), 0.0, e))
         return out
+
+
+def _velocity_starts(plant: MultibodyPlant) -> dict[str, int]:
+    """{joint that moves: index of its velocity}."""
+    return {
+        full_name(plant, j): j.velocity_start()
+        for j in one_dof_joints(plant)
+        if j.num_velocities()
+    }
 
 
 def with_step(scene: Scene, time_step: float) -> Scene:
