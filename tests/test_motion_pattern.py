@@ -199,6 +199,22 @@ def test_a_demonstration_becomes_segments_where_the_force_directions_change():
     assert pattern.ends_in_contact(0) and pattern.ends_in_contact(1)
 
 
+@pytest.mark.parametrize("degrees", [60, 90, 120])
+def test_a_demonstrated_corner_is_passed_within_the_acceleration_limit(degrees):
+    """At the demonstrated speed its pattern would take 2 to 6 m/s2 there."""
+    t = np.arange(0.0, 1.2, 0.005)
+    s, a = 0.5 * t, np.deg2rad(degrees)
+    p = np.stack([np.minimum(s, 0.3), 0.0 * s, 0.0 * s], axis=1)
+    p += np.maximum(s - 0.3, 0.0)[:, None] * [np.cos(a), np.sin(a), 0.0]
+    pose = np.hstack([p, np.tile([1.0, 0.0, 0.0, 0.0], (len(t), 1))])
+    pattern = pattern_from_demonstration(t, pose, np.zeros((len(t), 3)))
+    assert [segment.kind for segment in pattern.segments] == ["spline"]
+    s = np.linspace(0.0, pattern.length(0), 2000)
+    bend = max(np.linalg.norm(pattern.geometry(0, x)[2]) for x in s)
+    # As fast as that allows; bends are looked at in 513 points.
+    assert 0.95 < bend * pattern.speed(0) ** 2 / pattern.acceleration_max < 1.01
+
+
 def test_a_curved_demonstration_becomes_a_smooth_path_near_it():
     t = np.linspace(0.0, 5.0, 501)
     angle = np.pi * (t / 5.0)

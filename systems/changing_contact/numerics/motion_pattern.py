@@ -241,8 +241,9 @@ class MotionPattern:
         return self._head(k, SPEED)
 
     def largest_curvature(self, k: int) -> float:
-        """Of segment k [1/m]; 0 of a line."""
-        return _largest_curvature(self.table, k)
+        """Of segment k [1/m], among _LOOKED_AT of its points."""
+        points = np.linspace(0.0, self.length(k), _LOOKED_AT)
+        return max(float(np.linalg.norm(self.geometry(k, s)[2])) for s in points)
 
     def ends_in_contact(self, k: int) -> bool:
         """Whether the next segment has a force direction that segment k lacks."""
@@ -327,15 +328,6 @@ def _geometry(kind, X):
     if kind == "arc":
         return arc_data(X[0, :3], X[1, :3], X[2, :3], X[0, 3:], X[2, 3:])
     return spline_data(X)
-
-
-def _largest_curvature(table, k: int) -> float:
-    """Of segment k of a pattern's table [1/m], among _LOOKED_AT of its points."""
-    head = 1 + k * HEAD
-    if KINDS[int(table[head])] == "line":
-        return 0.0
-    points = np.linspace(0.0, float(table[head + LENGTH]), _LOOKED_AT)
-    return max(float(np.linalg.norm(path_point(table, k, s)[2, :3])) for s in points)
 
 
 def _has(directions, n) -> bool:

@@ -101,7 +101,10 @@ def duration_beside(track, law, t, dv):
     adds.)
     """
     T = max(step_duration(law, dv), steady_from(track, t) - t)
-    if track.n_steps == 0.0:
+    adds_up = False  # Of opposite signs neither makes the other larger.
+    for i in range(int(track.n_steps)):
+        adds_up |= track.steps[i].change * dv > 0.0
+    if not adds_up:
         return T
     longest = LONGEST * T
     while T < longest:

@@ -29,7 +29,7 @@ def solve_interior(fac, T, T_N, h, v0_fixed, lower, upper, start, x, v):
 
     Args: as of solve_bounded; start: complementarity of each bound at the start, in
         units of the cost of the states in x.
-    Returns: whether it converged. If not, as a rule no plan meets the bounds.
+    Returns: whether it converged. If not, no plan meets the bounds, or rounding is why.
     """
     (N, n_v), K = v.shape, len(T)
     n_x = x.shape[1]
