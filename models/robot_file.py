@@ -122,26 +122,25 @@ def _of_document(document: Any, path: Path, suffix: str, packages) -> RobotFile:
         for element in document.getElementsByTagName(kind):
             for uri, write in _meshes(element):
                 where = path_of(uri, path, packages)
-                if where is None or not where.is_file():
-                    usable = False
-                elif kind == "collision":
-                    usable = True
+                there = where if where is not None and where.is_file() else None
+                if there is not None and kind == "visual":
+                    if there.suffix in READ_BY_DRAKE:
+                        write(f"file://{there.resolve()}")
+                    else:
+                        _remove(element)  # Drake draws no others.
+                    continue
+                if there is not None:
                     try:
-                        write(f"file://{as_obj(where.resolve())}")
-                    except ValueError:
-                        usable = False
-                elif where.suffix not in READ_BY_DRAKE:
-                    usable = True
-                    _remove(element)  # Drake draws no others.
+                        write(f"file://{as_obj(there.resolve())}")
+                        continue
+                    except ValueError:  # It holds no mesh that can be read.
+                        pass
+                gone[uri] = where
+                if kind == "visual":
+                    visuals += 1
+                    _remove(element)
                 else:
-                    usable = True
-                    write(f"file://{where.resolve()}")
-                if not usable:
-                    gone[uri] = where
-                    collisions += kind == "collision"
-                    if kind == "visual":
-                        visuals += 1
-                        _remove(element)
+                    collisions += 1
     make_mesh_paths_absolute(document, path.parent)
     notes = _cleaned_mimics(document) + _unused(document)
     if suffix == ".urdf":

@@ -2,13 +2,14 @@
 
 import numpy as np
 import pytest
+from chain_against_drake import assert_moves_as_in_drake
 from hypothesis import given
 from hypothesis import strategies as st
 from pydrake.geometry import AddContactMaterial, HalfSpace, ProximityProperties, Sphere
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
-from pydrake.multibody.tree import JacobianWrtVariable, MultibodyForces
+from pydrake.multibody.tree import MultibodyForces
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import Demultiplexer
@@ -71,7 +72,7 @@ def test_a_chain_of_both_kinds_of_joints_agrees_with_drake():
     plant.Finalize()
     chain = serial_chain_of(plant, "tip")
     context = plant.CreateDefaultContext()
-    tip, world = plant.GetFrameByName("tip"), plant.world_frame()
+    tip = plant.GetFrameByName("tip")
     rng = np.random.default_rng(0)
     close = dict(atol=1e-11, rtol=1e-11)
     for _ in range(20):
@@ -79,19 +80,11 @@ def test_a_chain_of_both_kinds_of_joints_agrees_with_drake():
         plant.SetPositions(context, q)
         plant.SetVelocities(context, v)
         s = chain_state(chain, q, v)
-        np.testing.assert_allclose(s.M, plant.CalcMassMatrix(context), **close)
         forces = MultibodyForces(plant)  # Gravity and the joints' damping.
         plant.CalcForceElementsContribution(context, forces)
         needed = plant.CalcInverseDynamics(context, np.zeros(5), forces)
         np.testing.assert_allclose(s.bias, needed, **close)
-        args = (context, JacobianWrtVariable.kV, tip, [0, 0, 0], world, world)
-        J = plant.CalcJacobianSpatialVelocity(*args)
-        np.testing.assert_allclose(s.J, np.vstack([J[3:], J[:3]]), **close)
-        a = plant.CalcBiasSpatialAcceleration(*args).get_coeffs()
-        np.testing.assert_allclose(s.bias_a, np.concatenate([a[3:], a[:3]]), **close)
-        X = tip.CalcPoseInWorld(context)
-        np.testing.assert_allclose(s.p_WE, X.translation(), **close)
-        np.testing.assert_allclose(s.R_WE, X.rotation().matrix(), **close)
+        assert_moves_as_in_drake(s, plant, context, tip, **close)
 
 
 # A gantry: three rails, so that the mass at the tip is the same everywhere.

@@ -597,9 +597,7 @@ def _in_si_by_size(found, told, columns, of) -> dict[str, Match]:
         if match.channel is None or name not in columns:
             continue
         at, _, what = match.channel.rpartition(".")
-        turns = (
-            at in of and not of[at].prismatic
-        )  # Degrees of one that slides are none.
+        turns = at in of and not of[at].prismatic
         if turns and "position" in what and degrees.get(_template(name)):
             why = "in degrees, by its name or its size"
             out[name] = Match(name, match.channel, DEG, why=f"{match.why}; {why}")
