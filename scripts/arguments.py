@@ -184,7 +184,8 @@ def make_parser(functions: Mapping[str, Callable]) -> argparse.ArgumentParser:
     p.add_argument(
         "--set", dest="which", default="standard", metavar="SET",
         help="set of cases, for gap: standard (default), development, "
-        "logs-development, logs-final, contact-development or contact-final",
+        "logs-development, logs-final, contact-development, contact-final, driven or "
+        "driven-final",
     )  # fmt: skip
     p.add_argument(
         "--only",

@@ -20,6 +20,7 @@ from tqdm import tqdm
 import makebreak
 from makebreak.scripts.gap_scoring import (
     CONTACT,
+    DRIVEN,
     LOGS,
     STANDARD,
     Goals,
@@ -56,6 +57,12 @@ SETS = {
     ),
     "contact-final": BenchmarkSet(
         _TESTS / "contact_cases.py", CONTACT, "where robots touch things"
+    ),
+    "driven": BenchmarkSet(
+        _TESTS / "driven_cases.py", DRIVEN, "robots that follow commands, for tuning"
+    ),
+    "driven-final": BenchmarkSet(
+        _TESTS / "driven_cases.py", DRIVEN, "robots that follow commands"
     ),
 }
 

@@ -1,6 +1,6 @@
 """Scores results of `makebreak gap` against the hidden effects."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +24,7 @@ class Goals:
 STANDARD = Goals()
 CONTACT = Goals(verdict=0.9, first=0.88, error=0.05, closed=0.9)
 LOGS = Goals(verdict=0.92, first=0.9, error=0.05, covered=0.85)
+DRIVEN = Goals(verdict=0.93, first=0.95, error=0.05, covered=0.88)
 
 _DRIVES = ("actuator_", "input_delay")
 _ONE_CHANNEL = ("sensor_bias", "sensor_delay", "sensor_lag")
@@ -86,7 +87,8 @@ def score(
     """
     verdicts = truth.get("verdicts") or [truth["verdict"]]
     hidden = [] if verdicts == ["gap_unnamed"] else truth["effects"]
-    found = _members(result.get("effects") or [], driven)
+    whole = {h["kind"] for h in hidden if "." not in str(h["at"])}
+    found = _members(result.get("effects") or [], driven, whole)
     asked = any(h.get("needed", True) for h in hidden)
     first = tied = None
     if asked:
@@ -148,14 +150,19 @@ def score(
 
 
 # Kinds whose value for several joints is that of each of them.
-_EACH = ("joint_", "rotor_inertia", "actuator_gain", "actuator_bias")
+_EACH = ("joint_", "rotor_inertia", "servo_gain", "actuator_gain", "actuator_bias")
 
 
-def _members(effects: Sequence[Mapping], driven: Sequence[str]) -> list[Mapping]:
-    """The effects, with one on several joints as one on each of them."""
+def _members(
+    effects: Sequence[Mapping], driven: Sequence[str], whole: Collection[str] = ()
+) -> list[Mapping]:
+    """The effects, with one on several joints, or on all of a model, as one on each of
+    them; kinds of `whole` stay at all of a model."""
     out: list[Mapping] = []
     for each in effects:
         at = [each["at"]] if isinstance(each["at"], str) else list(each["at"])
+        if len(at) == 1 and "." not in at[0] and each["kind"] not in whole:
+            at = [name for name in driven if name.startswith(f"{at[0]}.")] or at
         if each["kind"].startswith(_EACH) and len(at) > 1:
             out += [{**each, "at": [one]} for one in at]
         else:

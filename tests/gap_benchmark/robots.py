@@ -25,7 +25,8 @@ class Body:
 
     xyz [m], rpy [rad]: of the joint in the body before. com [m]. inertia: about the
     centre of mass, in the body's axes, ixx iyy izz ixy ixz iyz [kg m2]. rotor: at the
-    joint [kg m2, or kg]. effort: the drive's limit [N m, or N].
+    joint [kg m2, or kg]. effort: the drive's limit [N m, or N]. on: the body that it is
+    on, None: the one before it, "": the base. touch: radius of what can touch [m].
     """
 
     name: str
@@ -39,6 +40,8 @@ class Body:
     sliding: bool = False
     rotor: float = 0.0
     effort: float = 100.0
+    on: str | None = None
+    touch: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -274,8 +277,16 @@ def to_urdf(robot: Robot) -> str:
             f'<link name="{body.name}"><inertial><origin xyz="{three(body.com)}"/>'
             f'<mass value="{body.mass:.10g}"/><inertia {inertia}/></inertial>'
             f'<visual><origin xyz="{three(body.com)}"/><geometry><sphere '
-            'radius="0.03"/></geometry></visual></link>'
+            'radius="0.03"/></geometry></visual>'
+            + (
+                f'<collision><origin xyz="{three(body.com)}"/><geometry><sphere '
+                f'radius="{body.touch:g}"/></geometry></collision>'
+                if body.touch
+                else ""
+            )
+            + "</link>"
         )
+        parent = parent if body.on is None else body.on or "base"
         name = body.joint or f"{body.name}_weld"
         kind = ("prismatic" if body.sliding else "revolute") if body.joint else "fixed"
         out.append(
@@ -301,45 +312,62 @@ def to_urdf(robot: Robot) -> str:
     return "\n".join([*out, "</robot>\n"])
 
 
+EXACT = 'integrator="RK4" iterations="50" tolerance="1e-12"'
+HARD = 'solreffriction="0.002 1" solimpfriction="0.9999 0.9999 0.001"'
+
+
 def to_mjcf(
     robot: Robot,
     gravity,
     damping: np.ndarray,
     friction: np.ndarray,
     play: Mapping[int, str] | None = None,
+    option: str = EXACT,
+    dry: str = HARD,
 ) -> str:
     """damping (n,) and friction (n,): of each joint. play: {joint: attributes} of
     joints with a second one behind the motor's, a spring or a gap: the rotor sits on
-    the first, the link's angle is the sum of both."""
+    the first, the link's angle is the sum of both. option, dry: of the solver, and of
+    how dry friction is solved for."""
     play = play or {}
 
     def text(values) -> str:
         return " ".join(f"{float(v):.17g}" for v in values)
 
-    out, i = [], 0
+    on: dict[str, list[Body]] = {}
+    before = ""
     for body in robot.bodies:
-        joint = ""
+        on.setdefault(before if body.on is None else body.on, []).append(body)
+        before = body.name
+    number = {body.name: i for i, body in enumerate(robot.moving)}
+
+    def nested(body: Body) -> str:
+        joint, shape = "", ""
         if body.joint:
+            i = number[body.name]
             kind = f'type="{"slide" if body.sliding else "hinge"}" '
             kind += f'axis="{text(body.axis)}"'
             joint = (
                 f'<joint name="{body.joint}" {kind} armature="{body.rotor:.17g}" '
-                f'damping="{damping[i]:.17g}" frictionloss="{friction[i]:.17g}" '
-                'solreffriction="0.002 1" solimpfriction="0.9999 0.9999 0.001"/>'
+                f'damping="{damping[i]:.17g}" frictionloss="{friction[i]:.17g}" {dry}/>'
             )
             if i in play:
                 joint += f'<joint name="{body.joint}_play" {kind} {play[i]}/>'
-            i += 1
-        out.append(
+        if body.touch:
+            shape = f'<geom size="{body.touch:g}" pos="{text(body.com)}" mass="0"/>'
+        return (
             f'<body name="{body.name}" pos="{text(body.xyz)}" '
             f'quat="{text(quaternion(body.rpy))}"><inertial pos="{text(body.com)}" '
-            f'mass="{body.mass:.17g}" fullinertia="{text(body.inertia)}"/>{joint}'
+            f'mass="{body.mass:.17g}" fullinertia="{text(body.inertia)}"/>'
+            + joint
+            + shape
+            + "".join(map(nested, on.get(body.name, ())))
+            + "</body>"
         )
+
     return (
         '<mujoco><compiler angle="radian" inertiafromgeom="false"/>'
-        f'<option integrator="RK4" gravity="{text(gravity)}" iterations="50" '
-        'tolerance="1e-12"/><worldbody>'
-        + "".join(out)
-        + "</body>" * len(robot.bodies)
+        f'<option gravity="{text(gravity)}" {option}/><worldbody>'
+        + "".join(map(nested, on[""]))
         + "</worldbody></mujoco>"
     )
