@@ -15,28 +15,22 @@ print(result.verdict, [each.kind for each in result.effects])
 write_report(result, read_scene("scene.yaml"), "report")
 """
 
-from importlib import import_module
+from typing import TYPE_CHECKING
 
-# What users import, and where it is; imported when asked for, so that a part of it
-# does not wait for the whole.
-_EXPORTS = {
-    "GapResult": "gap.result",
-    "Recording": "gap.data.recording",
-    "read_recording": "gap.data.reading",
-    "read_recordings": "gap.data.reading",
-    "read_scene": "models.scene",
-    "run_gap": "gap.workflow",
-    "write_recording": "gap.data.table",
-    "write_report": "gap.report.files",
-}
-__all__ = list(_EXPORTS)
+from makebreak.lazy import offered
 
-
-def __getattr__(name: str):
-    if name not in _EXPORTS:
-        raise AttributeError(f"module 'makebreak.gap' has no attribute {name!r}")
-    return getattr(import_module(f"makebreak.{_EXPORTS[name]}"), name)
-
-
-def __dir__() -> list[str]:
-    return [*globals(), *_EXPORTS]
+# What users import; imported when asked for, so that a part of it does not wait for
+# the whole.
+if TYPE_CHECKING:
+    from makebreak.gap.data.reading import (
+        read_recording as read_recording,
+        read_recordings as read_recordings,
+    )
+    from makebreak.gap.data.recording import Recording as Recording
+    from makebreak.gap.data.table import write_recording as write_recording
+    from makebreak.gap.report.files import write_report as write_report
+    from makebreak.gap.result import GapResult as GapResult
+    from makebreak.gap.workflow import run_gap as run_gap
+    from makebreak.models.scene import read_scene as read_scene
+else:
+    __getattr__, __dir__, __all__ = offered(__name__)

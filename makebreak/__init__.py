@@ -1,71 +1,95 @@
 """Adaptive control for robots that make and break contact, on Drake."""
 
-from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+from makebreak.lazy import offered
 
 __version__ = "0.1.0"
 
-# What users import, and where it is; imported when asked for, so that `import
-# makebreak` alone is cheap.
-_EXPORTS = {
-    "ContactMpcConfig": "diagrams.contact_mpc",
-    "make_contact_mpc": "diagrams.contact_mpc",
-    "AnitescuLcs": "systems.contact_mpc.lcs_builder",
-    "AnitescuLcsBuilder": "systems.contact_mpc.lcs_builder",
-    "ContactPair": "systems.contact_mpc.lcs_builder",
-    "LcsBuilderConfig": "systems.contact_mpc.lcs_builder",
-    "C3Config": "systems.contact_mpc.c3_mpc",
-    "C3Mpc": "systems.contact_mpc.c3_mpc",
-    "C3Bounds": "systems.contact_mpc.numerics.c3_mpc",
-    "C3Options": "systems.contact_mpc.numerics.c3_mpc",
-    "C3Problem": "systems.contact_mpc.numerics.c3_mpc",
-    "C3Weights": "systems.contact_mpc.numerics.c3_mpc",
-    "solve_c3": "systems.contact_mpc.numerics.c3_mpc",
-    "ExactProjection": "systems.contact_mpc.numerics.c3_projections",
-    "PlusProjection": "systems.contact_mpc.numerics.c3_projections",
-    "QpProjection": "systems.contact_mpc.numerics.c3_projections",
-    "LCS": "systems.contact_mpc.numerics.lcs",
-    "simulate": "systems.contact_mpc.numerics.lcs",
-    "LcsPlant": "systems.contact_mpc.lcs_plant",
-    "PosteriorConfig": "systems.contact_mpc.residual_learner",
-    "ResidualLearner": "systems.contact_mpc.residual_learner",
-    "ResidualLearnerConfig": "systems.contact_mpc.residual_learner",
-    "ContactDetector": "systems.changing_contact.contact_detector",
-    "ContactDetectorConfig": "systems.changing_contact.contact_detector",
-    "MotionPattern": "systems.changing_contact.numerics.motion_pattern",
-    "Segment": "systems.changing_contact.numerics.motion_pattern",
-    "Anitescu": "systems.contact_mpc.lcs_builder",
-    "StewartTrinkle": "systems.contact_mpc.lcs_builder",
-    "OrientationWeight": "systems.contact_mpc.numerics.c3_mpc",
-    "ModeDetector": "systems.changing_contact.mode_detector",
-    "ModeDetectorConfig": "systems.changing_contact.mode_detector",
-    "KalmanContactAnticipator": "systems.changing_contact.contact_anticipator",
-    "ContactAnticipatorConfig": "systems.changing_contact.contact_anticipator",
-    "VelocityShaper": "systems.changing_contact.velocity_shaper",
-    "VelocityShaperConfig": "systems.changing_contact.velocity_shaper",
-    "ContactSampler": "systems.contact_mpc.contact_sampler",
-    "ContactSamplerConfig": "systems.contact_mpc.contact_sampler",
-    "PoseTracker": "systems.perception.pose_tracker",
-    "PoseTrackerConfig": "systems.perception.pose_tracker",
-    "Marker": "systems.perception.pose_tracker",
-    "PushedObject": "models.pushed_object",
-    "make_tip_and_object": "models.pushed_object",
-    "ImpedanceController": "systems.arm.impedance_controller",
-    "ImpedanceConfig": "systems.arm.impedance_controller",
-    "serial_chain_of": "systems.arm.impedance_controller",
-    "TipState": "systems.arm.tip_state",
-}
-__all__ = ["model_path", *_EXPORTS]
-
-
-def __getattr__(name: str):
-    if name not in _EXPORTS:
-        raise AttributeError(f"module 'makebreak' has no attribute {name!r}")
-    return getattr(import_module(f"makebreak.{_EXPORTS[name]}"), name)
-
-
-def __dir__() -> list[str]:
-    return [*globals(), *_EXPORTS]
+# What users import; imported when asked for, so that `import makebreak` alone is cheap.
+if TYPE_CHECKING:
+    from makebreak.diagrams.contact_mpc import (
+        ContactMpcConfig as ContactMpcConfig,
+        make_contact_mpc as make_contact_mpc,
+    )
+    from makebreak.models.pushed_object import (
+        PushedObject as PushedObject,
+        make_tip_and_object as make_tip_and_object,
+    )
+    from makebreak.systems.arm.impedance_controller import (
+        ImpedanceConfig as ImpedanceConfig,
+        ImpedanceController as ImpedanceController,
+        serial_chain_of as serial_chain_of,
+    )
+    from makebreak.systems.arm.tip_state import TipState as TipState
+    from makebreak.systems.changing_contact.contact_anticipator import (
+        ContactAnticipatorConfig as ContactAnticipatorConfig,
+        KalmanContactAnticipator as KalmanContactAnticipator,
+    )
+    from makebreak.systems.changing_contact.contact_detector import (
+        ContactDetector as ContactDetector,
+        ContactDetectorConfig as ContactDetectorConfig,
+    )
+    from makebreak.systems.changing_contact.mode_detector import (
+        ModeDetector as ModeDetector,
+        ModeDetectorConfig as ModeDetectorConfig,
+    )
+    from makebreak.systems.changing_contact.numerics.motion_pattern import (
+        MotionPattern as MotionPattern,
+        Segment as Segment,
+    )
+    from makebreak.systems.changing_contact.velocity_shaper import (
+        VelocityShaper as VelocityShaper,
+        VelocityShaperConfig as VelocityShaperConfig,
+    )
+    from makebreak.systems.contact_mpc.c3_mpc import (
+        C3Config as C3Config,
+        C3Mpc as C3Mpc,
+    )
+    from makebreak.systems.contact_mpc.contact_sampler import (
+        ContactSampler as ContactSampler,
+        ContactSamplerConfig as ContactSamplerConfig,
+    )
+    from makebreak.systems.contact_mpc.lcs_builder import (
+        Anitescu as Anitescu,
+        AnitescuLcs as AnitescuLcs,
+        AnitescuLcsBuilder as AnitescuLcsBuilder,
+        ContactPair as ContactPair,
+        LcsBuilderConfig as LcsBuilderConfig,
+        StewartTrinkle as StewartTrinkle,
+    )
+    from makebreak.systems.contact_mpc.lcs_plant import LcsPlant as LcsPlant
+    from makebreak.systems.contact_mpc.numerics.c3_mpc import (
+        C3Bounds as C3Bounds,
+        C3Options as C3Options,
+        C3Problem as C3Problem,
+        C3Weights as C3Weights,
+        OrientationWeight as OrientationWeight,
+        solve_c3 as solve_c3,
+    )
+    from makebreak.systems.contact_mpc.numerics.c3_projections import (
+        ExactProjection as ExactProjection,
+        PlusProjection as PlusProjection,
+        QpProjection as QpProjection,
+    )
+    from makebreak.systems.contact_mpc.numerics.lcs import (
+        LCS as LCS,
+        simulate as simulate,
+    )
+    from makebreak.systems.contact_mpc.residual_learner import (
+        PosteriorConfig as PosteriorConfig,
+        ResidualLearner as ResidualLearner,
+        ResidualLearnerConfig as ResidualLearnerConfig,
+    )
+    from makebreak.systems.perception.pose_tracker import (
+        Marker as Marker,
+        PoseTracker as PoseTracker,
+        PoseTrackerConfig as PoseTrackerConfig,
+    )
+else:
+    __getattr__, __dir__, __all__ = offered(__name__)
+    __all__.append("model_path")
 
 
 def model_path(name: str) -> str:

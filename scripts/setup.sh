@@ -195,8 +195,8 @@ case "$drake $version" in
     *) fail "$python is Python $version, expected $versions (for Drake $drake);" \
         "set MAKEBREAK_PYTHON to one of these" ;;
 esac
-case "$(uname -sm)" in
-    "Linux x86_64" | "Darwin arm64") ;;
+case "$drake $(uname -sm)" in
+    *" Linux x86_64" | *" Darwin arm64" | "1.58 Linux aarch64") ;;
     *) fail "this is $(uname -sm), expected Linux x86_64: Drake $drake has no wheel" ;;
 esac
 

@@ -1,18 +1,19 @@
 """scripts/setup.sh, run.sh and test.sh, with a stand-in for Python that records what it
-is asked to do; and what a wheel contains."""
+is asked to do; and the lock files."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
-import zipfile
 from pathlib import Path
 
 import pytest
 from packaging.markers import Marker
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parent.parent
-ROOMS = ("models", "systems", "diagrams", "gap", "scripts")
 LOCKS = {"1.51": "requirements.lock", "1.58": "requirements-drake-1.58.lock"}
 
 # Answers like a Python that lacks nothing. Each call is a line of calls.txt; a file
@@ -201,22 +202,41 @@ def test_drake_that_cannot_be_installed_is_refused(checkout, drake, python, says
     assert checkout.calls() == []
 
 
+def pins(name, python="3.12"):
+    """{package: version} of a lock file for a version of Python."""
+    found = {}
+    for line in (ROOT / name).read_text().splitlines():
+        pin, _, marker = line.partition(";")
+        environment = {"python_full_version": f"{python}.0", "python_version": python}
+        if not pin.strip() or pin.startswith("#"):
+            continue
+        if not marker or Marker(marker).evaluate(environment):
+            package, _, version = pin.strip().partition("==")
+            found[package] = version
+    return found
+
+
+@pytest.mark.parametrize(
+    ("drake", "python"),
+    [("1.51", "3.10"), ("1.51", "3.11"), ("1.51", "3.14"), ("1.58", "3.12")],
+)
+def test_pins_are_within_the_ranges_of_the_package(drake, python):
+    """What is tested must be what an installation from the ranges may get."""
+    pinned = pins(LOCKS[drake], python)
+    text = (ROOT / "pyproject.toml").read_text()
+    lists = re.findall(r"^(?:dependencies|dev) = \[\n(.*?)^\]", text, re.M | re.S)
+    asked = [
+        Requirement(each) for each in re.findall(r'^ +"(.*)",', "".join(lists), re.M)
+    ]
+    assert {"drake", "pytest"} < {each.name for each in asked}
+    for each in asked:
+        if each.marker is None or each.marker.evaluate({"python_version": python}):
+            assert pinned[canonicalize_name(each.name)] in each.specifier, str(each)
+
+
 def test_lock_files_differ_in_drake_alone():
     """On Python 3.12, which both are for; so that a difference between two
     environments can only come from Drake."""
-
-    def pins(name):
-        found = {}
-        for line in (ROOT / name).read_text().splitlines():
-            pin, _, marker = line.partition(";")
-            environment = {"python_full_version": "3.12.0", "python_version": "3.12"}
-            if not pin.strip() or pin.startswith("#"):
-                continue
-            if not marker or Marker(marker).evaluate(environment):
-                package, _, version = pin.strip().partition("==")
-                found[package] = version
-        return found
-
     old, new = pins(LOCKS["1.51"]), pins(LOCKS["1.58"])
     assert (old.pop("drake"), new.pop("drake")) == ("1.51.1", "1.58.0")
     assert old == new
@@ -327,22 +347,3 @@ def test_test_script_runs_pytest_in_the_checkout(checkout):
     cores = len(os.sched_getaffinity(0))  # OMP_NUM_THREADS does not bind it.
     done = checkout("test.sh", OMP_NUM_THREADS="1")
     assert done.stdout.splitlines()[:2] == ["-n", str(cores)]
-
-
-def test_wheel_has_every_file_of_the_rooms(tmp_path):
-    copy = tmp_path / "copy"
-    rooms = [room for room in ROOMS if (ROOT / room).exists()]
-    for name in ("makebreak", *rooms):
-        ignore = shutil.ignore_patterns("__pycache__")
-        shutil.copytree(ROOT / name, copy / name, symlinks=True, ignore=ignore)
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(ROOT / name, copy / name)
-    pip = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-index"]
-    pip += ["--no-build-isolation", "-w", str(tmp_path), str(copy)]
-    done = subprocess.run(pip, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout + done.stderr
-    (wheel,) = tmp_path.glob("*.whl")
-    held = {n for n in zipfile.ZipFile(wheel).namelist() if n.startswith("makebreak/")}
-    files = [p for room in rooms for p in (copy / room).rglob("*") if p.is_file()]
-    expected = {f"makebreak/{p.relative_to(copy)}" for p in files if p.suffix != ".sh"}
-    assert expected | {"makebreak/__init__.py", "makebreak/__main__.py"} == held
