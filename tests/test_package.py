@@ -92,7 +92,8 @@ def test_sdist_has_what_its_readers_need(archives):
 def test_the_version_is_the_same_everywhere():
     found = {}
     for name in ("pyproject.toml", "makebreak/__init__.py", "CITATION.cff"):
-        line = re.search(r"^_*version\W+([\w.]+)", (ROOT / name).read_text(), re.M)
+        text = (ROOT / name).read_text()
+        line = re.search(r'^_*version[_ :="]+([0-9.]+)', text, re.M)
         assert line, name
         found[name] = line[1]
     assert len(set(found.values())) == 1, found
