@@ -244,7 +244,8 @@ def make_parser(functions: Mapping[str, Callable]) -> argparse.ArgumentParser:
         "recordings",
         nargs="+",
         metavar="RECORDING",
-        help="a log: .csv, .npz, .parquet, a ROS bag or a LeRobot dataset",
+        help="a log: .csv, .npz, .mat, .parquet, a ROS bag or a LeRobot dataset; a "
+        "pattern ('runs/*.csv') or a folder names several",
     )
     p.add_argument(
         "--skip-bad-rows",
@@ -273,7 +274,7 @@ def make_parser(functions: Mapping[str, Callable]) -> argparse.ArgumentParser:
     p.add_argument(
         "log",
         metavar="LOG",
-        help="a log: .csv, .npz, .parquet, a ROS bag or a LeRobot dataset",
+        help="a log: .csv, .npz, .mat, .parquet, a ROS bag or a LeRobot dataset",
     )
     p.add_argument(
         "--robot",

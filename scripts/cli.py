@@ -188,20 +188,13 @@ def _gap(args) -> int:
 
 
 def _gap_until(args, interrupt, drake) -> int:
-    from makebreak.gap.data.bags import is_bag, is_dataset
+    from makebreak.gap.data.recording_files import recording_files
+    from makebreak.gap.data.table import has_table
     from makebreak.scripts.gap_command import effects_table, run_and_report
 
-    recordings = [Path(text) for text in args.recordings]
-    for path in recordings:
-        if not (path.is_file() or is_bag(path) or is_dataset(path)):
-            raise ValueError(
-                f"recording {path} does not exist"
-                if not path.exists()
-                else f"recording {path} is a folder, expected a file, a ROS bag or a "
-                "LeRobot dataset"
-            )
+    recordings = recording_files(args.recordings)
     robot = Path(args.scene)
-    if robot.is_file() and robot.suffix.lower() in (".csv", ".npz", ".parquet", ".gz"):
+    if robot.is_file() and has_table(robot):
         raise ValueError(
             f"{robot} is a recording, expected the scene or robot first: "
             "makebreak gap SCENE RECORDING"

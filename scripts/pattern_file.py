@@ -49,7 +49,7 @@ def read_pattern(path: str | Path, model: Scene) -> MotionPattern:
         )
     if path.suffix.lower() in YAML:
         return load_pattern(path)
-    if suffix_of(path) not in FORMATS:
+    if suffix_of(path) not in (*FORMATS, ".csv.gz"):
         raise ValueError(
             f'pattern {path}: the name ends in "{path.suffix}", expected one of '
             f"{', '.join((*YAML, *FORMATS))}"

@@ -279,7 +279,7 @@ def back(log: Log):
     t = log.time.copy()
     t[500] = t[480]
     log.columns = {"time": t} | log.columns
-    return ("does not increase",)
+    return ("step back",)
 
 
 def twice(log: Log):
@@ -430,7 +430,7 @@ def seen(robot_path: Path, log_path: Path, log: Log) -> Seen:
     except ValueError as error:
         told = str(error)
         gains = log.truth.get("gains")
-        right = "does not increase" in told
+        right = False
         if gains is not None:
             each = re.findall(r"_current: ([\d.]+)", told)
             right = len(each) == len(gains) and np.allclose(
@@ -454,9 +454,8 @@ def seen(robot_path: Path, log_path: Path, log: Log) -> Seen:
             right = False
             continue
         mine = recording[name]
-        if len(mine) != len(true):
-            right = False
-            continue
+        if len(mine) != len(true):  # Rows were left out.
+            true = np.interp(recording.time, log.time, true)
         # A factor's digits are those that the data tell; friction is what it is.
         scale = np.std(true) or 1.0
         turn = 0.0

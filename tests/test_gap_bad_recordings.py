@@ -39,10 +39,6 @@ def without(head, rows, *columns):
     [
         (lambda h, r: "", "is empty"),
         (lambda h, r: h, "has a header and no rows"),
-        (lambda h, r: "\n".join([h, *r[:90], r[40], *r[90:]]),
-         "column time does not increase at row 91: 0.4 after 0.89"),
-        (lambda h, r: "\n".join([h, *r[:50], r[50][3:], *r[51:]]),
-         "column time is not finite at row 51"),
         (lambda h, r: "\n".join([h, *r[:9], r[9].replace(",", ",x", 1), *r[10:]]),
          f"column {U}, row 10"),
         (lambda h, r: "\n".join(

@@ -95,7 +95,11 @@ def test_every_verdict_is_a_run_that_is_done(workflow, case, verdict, monkeypatc
             "SCENE: contact_learning is an experiment, exp",
         ),
         (["scene.yaml", "none.csv"], "recording none.csv does not exist"),
-        (["scene.yaml", "."], "recording . is a folder, expected a file, a ROS bag"),
+        (
+            ["scene.yaml", "empty"],
+            "recording empty is a folder without a log",
+        ),
+        (["scene.yaml", "*.mat"], "recording *.mat: no log has such a name"),
         (["run.csv", "run.csv"], "run.csv is a recording, expected the scene"),
         (["scene.yaml", "run.csv", "--jobs", "0"], "--jobs: got"),
         (["scene.yaml", "run.csv", "--out", "run.csv/x"], '--out: got "run.csv/x"'),
@@ -103,6 +107,7 @@ def test_every_verdict_is_a_run_that_is_done(workflow, case, verdict, monkeypatc
     ],
 )
 def test_bad_input_is_one_line_and_status_2(workflow, case, words, says, capsys):
+    Path("empty").mkdir()
     for path in case[:2]:
         Path(path.name).write_text(path.read_text())
     assert cli.main(["gap", *words]) == 2

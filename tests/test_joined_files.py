@@ -65,7 +65,28 @@ def test_what_cannot_be_joined_is_one_line(tmp_path, sidecar, says):
         read_recording(path)
 
 
-def test_stamps_that_go_back_are_named_by_file_and_row(tmp_path):
-    path = write(tmp_path, np.where(np.arange(40) == 7, 0.0, TIME))
-    with pytest.raises(ValueError, match=r"command.csv: column timestamp, row 8: 0"):
-        read_recording(path)
+def test_a_stamp_that_goes_back_is_said_and_its_row_left_out(tmp_path):
+    path = write(tmp_path, np.where(np.arange(40) == 7, -1e6, TIME))
+    found = read_recording(path)
+    ((kind, says),) = found.notes
+    assert kind == "stamps_back" and says.startswith("command.csv: 1 stamps step back")
+    np.testing.assert_allclose(
+        found["a.j.position_command"], np.where(np.arange(40) == 7, np.nan, TOLD),
+        atol=1e-9,
+    )  # fmt: skip
+
+
+def test_a_file_that_calls_its_time_otherwise_is_joined_by_what_looks_like_one(
+    tmp_path,
+):
+    """In seconds beside the other's microseconds."""
+    path = write(tmp_path)
+    rows = "".join(f"{1e-6 * t:.9g},{x:.9g}\n" for t, x in zip(TIME, TOLD, strict=True))
+    (tmp_path / "command.csv").write_text("t [s],target\n" + rows)
+    (tmp_path / "state.yaml").write_text(
+        "join: command.csv\ncolumns: {timestamp: {channel: time, scale: 1.0e-6}, "
+        "positions: a.j.position, event: null, target: a.j.position_command}"
+    )
+    found = read_recording(path)
+    np.testing.assert_allclose(found.time, 1e-6 * TIME, atol=1e-12)
+    np.testing.assert_allclose(found["a.j.position_command"], TOLD, atol=1e-9)

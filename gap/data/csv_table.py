@@ -1,5 +1,6 @@
-"""csv tables as they come: other separators, decimal commas, quotes, lists in cells,
-packed with gzip; read in blocks, so that no long file is ever held whole."""
+"""Tables in text as they come: other separators, blanks, comments, decimal commas,
+quotes, lists in cells, packed with gzip; read in blocks, so that no long file is ever
+held whole."""
 
 import csv
 import gzip
@@ -59,7 +60,6 @@ class BadRows:
     def __init__(self, path: Path, skip: bool):
         self._path, self.skip = path, skip
         self.count, self.why = 0, list[str]()
-        self.twice = 0  # Rows that are the row before once more.
         self.headless = 0  # Columns of a file that does not name them.
 
     def add(self, why: str) -> None:
@@ -78,9 +78,6 @@ class BadRows:
             says = f"{self._path.name} has no header: its columns are called "
             says += f"{NAMELESS}1 to {NAMELESS}{self.headless}"
             found.append(("no_header", says))
-        if self.twice:
-            says = f"{self._path.name}: {self.twice} rows are the row before once more "
-            found.append(("rows_twice", says + "(time and all values): left out"))
         if not self.count:
             return found
         more = self.count - len(self.why)
@@ -103,6 +100,24 @@ def size_of(path: Path) -> int:
         return max(int.from_bytes(file.read(4), "little"), path.stat().st_size)
 
 
+def header_of(file) -> bytes:
+    """The line of names, else the first row, of an open file that then stands below
+    it. Lines above it that begin with # or % are comments; the last of them has the
+    names where nothing else can (as numpy and MATLAB write them)."""
+    comment, start = b"", 0
+    while True:
+        line = file.readline()
+        if line[:1] not in (b"#", b"%") and (line.strip() or not line):
+            break
+        if line.strip():
+            comment, start = line[1:], file.tell()
+    names, row = (re.split(rb"[,;\t ]+", x.strip()) for x in (comment, line))
+    if comment and len(names) == len(row) and re.fullmatch(rb"[-+.\d].*|nan", row[0]):
+        file.seek(start)
+        return comment
+    return line
+
+
 def dialect_of(
     path: Path, header: bytes, sample: bytes, unused: frozenset[str] = frozenset()
 ) -> Dialect:
@@ -122,6 +137,11 @@ def dialect_of(
     for other in ";\t":  # "0,1;0,2" has as many decimal commas as separators.
         if other in plain and _are_values(plain.split(other), other):
             separator = other
+    if not re.search('[,;\t"]', text) and len(text.split()) > 1:
+        first = sample.lstrip().splitlines()[:1]  # "time [s]" may be one name.
+        if not first or len(first[0].split()) == len(text.split()):
+            separator = " "
+    text = " ".join(text.split()) if separator == " " else text
     names = [n.strip() for n in next(csv.reader([text], delimiter=separator), [])]
     headless = _are_values(names, separator)
     if headless:
@@ -229,6 +249,8 @@ def parse(
     if dialect.lists:
         return _by_line(dialect, names, text.decode(errors="replace"), done, bad, True)
     plain = text
+    if dialect.separator == " ":
+        plain = b"".join(b" ".join(x.split()) + b"\n" for x in text.splitlines())
     if dialect.quoted:
         plain = _QUOTED.sub(lambda m: _unquoted(m.group(1), dialect), plain)
     if dialect.separator != ",":
@@ -327,11 +349,13 @@ def text_columns(path: Path) -> dict[str, str]:
     """{column whose first cells are neither numbers nor lists of them: the text that is
     in all of these, "" where they differ}."""
     with open_csv(path) as file:
-        header = file.readline()
+        header = header_of(file)
         sample = file.read(1 << 16)
     dialect = dialect_of(path, header, sample)
     lines = _in_seconds(sample).decode(errors="replace").splitlines()[:20]
     found: dict[str, list[str]] = {}
+    if dialect.separator == " ":
+        lines = [" ".join(line.split()) for line in lines]
     for cells in csv.reader(lines, delimiter=dialect.separator):
         if len(cells) == len(dialect.names):
             for name, cell in zip(dialect.names, cells, strict=True):

@@ -1,14 +1,48 @@
 """Tables of one recording that lie in several files, as one table."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from makebreak.gap.data.table import RecordingTable
+from makebreak.gap.data.csv_table import BadRows, text_columns
+from makebreak.gap.data.proposal import find_time
+from makebreak.gap.data.stamps import mended
+from makebreak.gap.data.table import MOST_CELLS, RecordingTable, is_text, read_table
 
 
-def time_column(names: Mapping) -> str:
+def read_joined(
+    path: Path,
+    sidecar: Mapping,
+    most_cells: int = MOST_CELLS,
+    bad: BadRows | None = None,
+    with_text: bool = False,
+) -> tuple[RecordingTable, dict[str, str]]:
+    """The table of a file and of those that its sidecar joins to it; and columns of
+    text with what is in all their cells.
+
+    Args: sidecar: as read_sidecars gives it. with_text: whether columns of text are
+        left out, rather than refused.
+    Raises: ValueError, one line.
+    """
+    names = sidecar.get("columns") or {}
+    unused = frozenset(str(name) for name, to in names.items() if to is None)
+    tables, text = [], dict[str, str]()
+    for file in (path, *(sidecar.get("join") or ())):
+        own = {name.removeprefix(f"{file.name}:") for name in unused}
+        if with_text and is_text(file) and file.is_file():
+            more = text_columns(file)
+            text |= {n if n not in text else f"{file.name}:{n}": x
+                     for n, x in more.items()}  # fmt: skip
+            own |= {*more}
+        tables.append((file, read_table(file, most_cells, bad, frozenset(own))))
+    if len(tables) == 1:
+        return tables[0][1], text
+    return joined(*tables[0], tables[1:], _time_column(names)), text
+
+
+def _time_column(names: Mapping) -> str:
     """The name that a log gives its time; names: the sidecar's `columns`."""
     for foreign, target in names.items():
         ours = target.get("channel") if isinstance(target, dict) else target
@@ -27,25 +61,35 @@ def joined(
     not have there is missing (NaN).
 
     Args: others: files beside `path` and their tables; a name that is taken already is
-        `<file>:<name>` in the result. time: the stamps' column, of the same name, unit
-        and clock in all of them.
-    Raises: ValueError where a file lacks it, or its stamps do not increase.
+        `<file>:<name>` in the result. time: the stamps' column, of one clock in all
+        of them; where a file has no such column, the one that looks like a time.
+    Raises: ValueError where a file lacks it, or its time starts again.
     """
+    known = [time] if time in table.columns else table.columns
+    first = find_time({name: table.columns[name] for name in known})
+    unit, time = (1.0, time) if first is None else (first.scale, first.column)
+    tables, notes = [], []
     for file, each in ((path, table), *others):
-        if time not in each.columns:
-            raise ValueError(f"recording {file} needs the column {time} to be joined")
-        stamps = each.columns[time]
-        if not (np.diff(stamps) > 0.0).all():
-            k = int(np.argmin(np.diff(stamps) > 0.0))
+        own = dict(each.columns)
+        if time not in own:
+            found = find_time(own)
+            if found is None:
+                raise ValueError(
+                    f"recording {file} needs the column {time} to be joined"
+                )
+            own = {time: own.pop(found.column) * (found.scale / unit), **own}
+        own, row, more = mended(file.name, own, each.row, time)
+        if "episode" in own:
             raise ValueError(
-                f"recording {file}: column {time}, row {each.row[k + 1]}: "
-                f"{stamps[k + 1]:.9g} does not increase, which a file to be joined must"
+                f"recording {file}: {time} starts again, or it has episodes, which a "
+                "file to be joined must not"
             )
-    stamps = np.unique(
-        np.concatenate([t.columns[time] for t in (table, *(t for _, t in others))])
-    )
+        tables.append((file, replace(each, columns=own, row=row)))
+        notes += more
+    table = tables[0][1]
+    stamps = np.unique(np.concatenate([each.columns[time] for _, each in tables]))
     columns: dict[str, np.ndarray] = {time: stamps}
-    for file, each in ((path, table), *others):
+    for file, each in tables:
         at = np.searchsorted(stamps, each.columns[time])
         for name, value in each.columns.items():
             if name == time:
@@ -56,4 +100,5 @@ def joined(
     # A row that only another file has is told as the row before it.
     last = np.searchsorted(table.columns[time], stamps, "right") - 1
     row = table.row[np.maximum(last, 0)]
-    return RecordingTable(columns, row, max(table.n_rows, len(stamps)))
+    n = max(table.n_rows, len(stamps))
+    return RecordingTable(columns, row, n, (*table.notes, *notes))

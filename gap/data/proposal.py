@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import yaml
 
+from makebreak.gap.data.arrays import TIME_WORDS, words_of
 from makebreak.gap.data.csv_table import is_nameless
 from makebreak.gap.data.table import COMMANDS, is_channel
 
@@ -49,11 +50,6 @@ _PART = set(
     "contact".split()
 )
 _BESIDE = set("motor raw unfiltered".split())  # Another column is rather it.
-_TIME = set(
-    "time t timestamp timestamps stamp stamps ts sec secs seconds clock utime datetime "
-    "walltime epoch nsec nsecs usec usecs msec msecs nanoseconds microseconds "
-    "milliseconds".split()
-)
 _EPISODE = set("episode trial run".split())
 _TIME_UNITS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0}
 # Of a velocity to the derivative of its position: unit, factor to rad/s or m/s.
@@ -106,12 +102,6 @@ class Match:
     may: str = ""
 
 
-def words_of(name: str) -> list[str]:
-    """Lower-case words and numbers of a name, also of jointOne, q_1 and q[1]."""
-    name = re.sub(r"([a-z])([A-Z])", r"\1 \2", name)
-    return re.findall(r"[a-z]+|\d+", name.lower())
-
-
 def propose(
     columns: Mapping[str, np.ndarray],
     joints: Sequence[JointName],
@@ -127,7 +117,7 @@ def propose(
     text, said = text or {}, said or {}
     found = {name: Match(name, None, why="text") for name in text}
     found |= {name: match for name, match in said.items() if name in columns}
-    time = _find_time(columns)
+    time = find_time(columns)
     if time is not None and "time" not in {m.channel for m in said.values()}:
         found.setdefault(time.column, time)
     quantities = {}
@@ -432,13 +422,13 @@ def _once(found: dict[str, Match], said: Mapping[str, Match]) -> dict[str, Match
 # ----- Units
 
 
-def _find_time(columns: Mapping[str, np.ndarray]) -> Match | None:
+def find_time(columns: Mapping[str, np.ndarray]) -> Match | None:
     """The first column that increases and has a word for time in its name, or a unit of
     it in brackets (in any language), or no name and even steps."""
     for name, value in columns.items():
         words = words_of(name)
         if not (
-            set(words) & _TIME
+            set(words) & TIME_WORDS
             or words
             and words[0] in _TIME_UNITS
             or re.search(r"[\[(](ns|us|ms|s|sec)[\])]\s*$", name.lower())

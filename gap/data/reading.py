@@ -17,17 +17,17 @@ from makebreak.gap.data.episodes import (
     without_ignored,
 )
 from makebreak.gap.data.filters import read_filter
-from makebreak.gap.data.joined import joined, time_column
+from makebreak.gap.data.joined import read_joined
 from makebreak.gap.data.quaternions import mend_quaternions
 from makebreak.gap.data.recording import Channel, Episode, Recording
 from makebreak.gap.data.sidecar import read_sidecars, renamed, sidecar_of
+from makebreak.gap.data.stamps import mended
 from makebreak.gap.data.table import (
     COMMANDS,
     JOINT_QUANTITIES,
     MOST_CELLS,
     check_columns,
     is_channel,
-    read_table,
     stem_of,
 )
 from makebreak.gap.data.turns import without_turns
@@ -92,18 +92,16 @@ def read_recording(
     path = Path(path)
     sidecar = read_sidecars(path, sidecar_path)
     bad = BadRows(path, skip_bad_rows)
-    columns, row, n_rows, done = _read_columns(path, sidecar, most_cells, bad)
-    is_excerpt = len(row) + bad.count + bad.twice < n_rows
+    columns, row, n_rows, done, is_excerpt = _read_columns(
+        path, sidecar, most_cells, bad
+    )
     number = columns.get("episode")
     try:
         columns = check_columns(
             columns | {"episode": counted_parts(columns, row, is_excerpt)}
         )
     except ValueError as error:
-        says = _with_rows(path, error, row)
-        if "does not increase" in says:
-            says += " (--skip-bad-rows leaves such rows out)"
-        raise ValueError(says) from None
+        raise ValueError(_with_rows(path, error, row)) from None
     time, part = columns.pop("time"), columns.pop("episode")
     if not columns:
         raise ValueError(f"recording {path} has no channel beside time")
@@ -113,7 +111,6 @@ def read_recording(
     episodes, more = without_ignored(path, episodes, time, spans)
     notes = [*done, *notes, *more, *_without_empty(path, columns)]
     notes += _without_turns(path, columns, episodes)
-    _check_sizes(path, columns, row)
     flips, norm_errors = mend_quaternions(path, columns, episodes, row)
     if is_excerpt:
         says = f"{path.name} has {n_rows} rows, too many to hold: {len(time)} of them "
@@ -188,23 +185,20 @@ def _has(recording: Recording, name: str, episode: Episode) -> bool:
 
 def _read_columns(
     path: Path, sidecar: Mapping, most_cells: int, bad: BadRows
-) -> tuple[dict[str, np.ndarray], np.ndarray, int, Sequence[tuple[str, str]]]:
+) -> tuple[dict[str, np.ndarray], np.ndarray, int, Sequence[tuple[str, str]], bool]:
     """Columns under our names, (n,) numbers of their rows in the file, how many rows
-    that has, and notes of what was done; time is there and in seconds."""
+    that has, notes of what was done, and whether not all rows could be kept; time is
+    there, in seconds, and increases in each episode."""
     names = sidecar.get("columns") or {}
     unused = frozenset(str(name) for name, to in names.items() if to is None)
-    table = read_table(path, most_cells, bad, unused)
-    if others := sidecar.get("join"):
-        tables = []
-        for file in others:
-            own = {name.removeprefix(f"{file.name}:") for name in unused}
-            tables.append((file, read_table(file, most_cells, bad, frozenset(own))))
-        table = joined(path, table, tables, time_column(names))
+    table, _ = read_joined(path, sidecar, most_cells, bad)
+    is_excerpt = len(table.row) + bad.count < table.n_rows
     columns = renamed(path, table.columns, names, unused)
     _check_time(path, columns)
-    columns, row = _without_twice(columns, table.row, bad)
-    columns, row = _without_bad_rows(columns, row, bad)
-    return columns, row, table.n_rows, table.notes
+    columns, row = _without_bad_rows(columns, table.row, bad)
+    _check_sizes(path, columns, row)
+    columns, row, notes = mended(path.name, columns, row)
+    return columns, row, table.n_rows, (*table.notes, *notes), is_excerpt
 
 
 def _check_time(path: Path, columns: Mapping[str, np.ndarray]) -> None:
@@ -229,45 +223,17 @@ def _check_time(path: Path, columns: Mapping[str, np.ndarray]) -> None:
         )
 
 
-def _without_twice(
-    columns: dict[str, np.ndarray], row: np.ndarray, bad: BadRows
-) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Columns and row numbers without rows that say nothing new: some loggers write a
-    message that comes twice, with its stamp, as two rows."""
-    again = np.flatnonzero(np.diff(columns["time"]) == 0.0) + 1
-    for value in columns.values():
-        new, old = value[again], value[again - 1]
-        again = again[(new == old) | (np.isnan(new) & np.isnan(old))]
-    good = np.ones(len(row), bool)
-    good[again] = False
-    bad.twice = len(again)
-    if not bad.twice:
-        return columns, row
-    return {name: value[good] for name, value in columns.items()}, row[good]
-
-
 def _without_bad_rows(
     columns: dict[str, np.ndarray], row: np.ndarray, bad: BadRows
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Columns and row numbers without rows that hold what nothing measures, or come
-    before the row above them, where such are left out."""
+    """Columns and row numbers without rows that hold what nothing measures, where such
+    are left out."""
     if not bad.skip:
         return columns, row
     good = np.ones(len(row), bool)
     for name, value in columns.items():
         for k in np.flatnonzero(good & (np.abs(value) > MOST_VALUE)):
             bad.add(f"column {name}, row {row[k]}: got {value[k]:.4g}")
-            good[k] = False
-    time, episode = columns["time"], columns.get("episode", np.zeros(len(row)))
-    for k in np.flatnonzero(good & ~np.isfinite(time)):
-        bad.add(f"column time, row {row[k]}: got {time[k]}")
-        good[k] = False
-    rows = np.flatnonzero(good)
-    for number in np.unique(episode[rows]):
-        mine = rows[episode[rows] == number]
-        latest = np.maximum.accumulate(time[mine])
-        for k in mine[1:][time[mine[1:]] <= latest[:-1]]:
-            bad.add(f"column time, row {row[k]}: {time[k]} does not increase")
             good[k] = False
     return {name: value[good] for name, value in columns.items()}, row[good]
 

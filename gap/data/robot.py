@@ -13,7 +13,6 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 
 from makebreak.gap.data.content import Contents, Said, by_content, told_by
-from makebreak.gap.data.csv_table import text_columns
 from makebreak.gap.data.findings import (
     FIXED,
     GUESSED_GAINS,
@@ -22,6 +21,7 @@ from makebreak.gap.data.findings import (
     NO_DRIVE,
     Finding,
 )
+from makebreak.gap.data.joined import read_joined
 from makebreak.gap.data.proposal import (
     AS_SAID,
     CURRENT,
@@ -39,13 +39,11 @@ from makebreak.gap.data.servo_gains import (
     effort_shares,
     servo_gains,
 )
-from makebreak.gap.data.sidecar import own_sections
+from makebreak.gap.data.sidecar import own_sections, read_sidecars
 from makebreak.gap.data.table import (
     RecordingTable,
     is_channel,
-    read_table,
     stem_of,
-    suffix_of,
 )
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.joints import ROTOR
@@ -218,10 +216,8 @@ class Log:
 
 def read_log(path: Path) -> Log:
     """Raises: ValueError, one line, for a file that cannot be read."""
-    text: dict[str, str] = {}
-    if suffix_of(path) in (".csv", ".csv.gz") and path.is_file():
-        text = text_columns(path)
-    table = read_table(path, unused=frozenset(text))
+    sidecar = read_sidecars(path, None)
+    table, text = read_joined(path, sidecar, with_text=True)
     return Log(path, table, text, own_sections(path))
 
 
@@ -482,10 +478,8 @@ def _check_currents(
 def _says_all(log: Log) -> bool:
     """Whether a log's own sidecar needs no proposal beside it."""
     said = log.own.get("columns") or {}
-    return (
-        "join" in log.own
-        or bool(log.own)
-        and all(name in said or is_channel(name) for name in log.table.columns)
+    return bool(log.own) and all(
+        name in said or is_channel(name) for name in log.table.columns
     )
 
 

@@ -27,13 +27,15 @@ def has_sidecar(path: Path) -> bool:
 
 
 def own_sections(path: Path) -> dict:
-    """{section: as written} of the sidecar beside a recording; none: {}.
+    """{section: as written} of the sidecar beside a recording, with whole paths of
+    joined files; none: {}.
 
     Raises: ValueError as read_sidecars.
     """
-    read_sidecars(path, None)
+    join = read_sidecars(path, None).get("join")
     own = _own_sidecars(path)
-    return (_sections(own[0]) or {}) if own else {}
+    found = (_sections(own[0]) or {}) if own else {}
+    return found | ({"join": [str(file.resolve()) for file in join]} if join else {})
 
 
 def _own_sidecars(path: Path) -> list[Path]:

@@ -14,10 +14,9 @@ if it has one.
 
 import gzip
 import json
-import zipfile
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from importlib import import_module
 from pathlib import Path
@@ -25,11 +24,20 @@ from types import ModuleType
 
 import numpy as np
 
+from makebreak.gap.data.arrays import (
+    ARRAYS,
+    kept_rows,
+    read_mat,
+    read_npz,
+    spread,
+    why_not,
+)
 from makebreak.gap.data.bags import is_bag, is_dataset, read_bag, read_dataset
 from makebreak.gap.data.csv_table import (
     BadRows,
     blocks_of,
     dialect_of,
+    header_of,
     open_csv,
     parse,
     size_of,
@@ -43,13 +51,13 @@ POSE = "x y z qw qx qy qz".split()
 TWIST = "vx vy vz wx wy wz".split()
 WRENCH = "fx fy fz tx ty tz".split()
 QUANTITIES = frozenset([*JOINT_QUANTITIES, *POSE, *TWIST, *WRENCH])
-FORMATS = (".csv", ".csv.gz", ".npz", ".parquet")
+_TEXTS = (".csv", ".txt", ".tsv", ".dat")
+FORMATS = (".csv", ".npz", ".parquet")  # In which tables are written.
+_READ = ".csv, .txt, .tsv, .dat (.gz), .npz, .mat, .parquet"
 
 # More numbers than this are not kept in memory (320 MB): 3.6 h of 14 channels at
 # 200 Hz. Of a longer table, evenly spread stretches of rows are.
 MOST_CELLS = 40_000_000
-STRETCHES = 20
-MOST_BYTES = 1 << 32  # Of an npz file's columns together, as they are in memory.
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,6 +180,16 @@ def suffix_of(path: Path) -> str:
     return path.suffix.lower()
 
 
+def is_text(path: Path) -> bool:
+    """Whether a file's name says that it is a table in text."""
+    return suffix_of(path).removesuffix(".gz") in _TEXTS
+
+
+def has_table(path: Path) -> bool:
+    """Whether a file's name says that it is a table that is read here."""
+    return is_text(path) or suffix_of(path) in (*ARRAYS, ".parquet")
+
+
 def stem_of(path: Path) -> str:
     """The name without what suffix_of gives."""
     return path.name[: len(path.name) - len(suffix_of(path))]
@@ -183,7 +201,8 @@ def read_table(
     bad: BadRows | None = None,
     unused: frozenset[str] = frozenset(),
 ) -> RecordingTable:
-    """Reads a csv, npz or parquet file; nothing but its numbers is looked at.
+    """Reads a table in text, an npz, mat or parquet file, a bag or a LeRobot dataset;
+    nothing but its numbers is looked at.
 
     Args:
         path: the file. bad: what to do with rows of a csv that cannot be read; else
@@ -213,18 +232,21 @@ def _read_file(
     path: Path, most_cells: int, bad: BadRows | None, unused
 ) -> RecordingTable:
     suffix = suffix_of(path)
-    if path.is_dir() or suffix not in FORMATS:
-        raise ValueError(
-            f"recording {path}: expected a name in {', '.join(FORMATS)}, a bag (.bag, "
-            ".mcap, .db3, a folder with metadata.yaml) or a LeRobot dataset (a folder "
-            "with meta/info.json)"
+    if path.is_dir() or not has_table(path):
+        why = why_not(suffix) or (
+            f"expected a name in {_READ}, a bag (.bag, .mcap, .db3, a folder with "
+            "metadata.yaml) or a LeRobot dataset (a folder with meta/info.json)"
         )
+        raise ValueError(f"recording {path}: {why}")
     if not path.stat().st_size:
         raise ValueError(f"recording {path} is empty")
-    if suffix in (".csv", ".csv.gz"):
+    if is_text(path):
         return _read_csv(path, most_cells, bad or BadRows(path, False), unused)
-    read = {".npz": _read_npz, ".parquet": _read_parquet}
-    return read[suffix](path, most_cells, unused)
+    if suffix == ".parquet":
+        return _read_parquet(path, most_cells, unused)
+    read = read_npz if suffix == ".npz" else read_mat
+    columns, row, n, notes = read(path, most_cells, unused)
+    return replace(_columns_of(path, columns, row, n), notes=tuple(notes))
 
 
 def _parquet_columns(path: Path, unused: frozenset[str]) -> dict[str, np.ndarray]:
@@ -237,25 +259,15 @@ def _nearest(name: str) -> str:
     return f"; did you mean .{close[0]}?" if close else ""
 
 
-def _kept_rows(n_rows: int, n_columns: int, most_cells: int) -> list[tuple[int, int]]:
-    """[first, last) rows, from 0, that are kept of a table of n_rows."""
-    most_rows = max(most_cells // max(n_columns, 1), STRETCHES)
-    if n_rows <= most_rows:
-        return [(0, n_rows)]
-    length, every = most_rows // STRETCHES, n_rows / STRETCHES
-    starts = [int((i + 0.5) * every - 0.5 * length) for i in range(STRETCHES)]
-    return [(start, start + length) for start in starts]
-
-
 def _read_csv(path: Path, most_cells: int, bad: BadRows, unused) -> RecordingTable:
     try:
         with open_csv(path) as file:
-            header = file.readline()
+            header = header_of(file)
             body_start = file.tell()
             sample = file.read(1 << 20)
             dialect = dialect_of(path, header, sample, unused)
             if dialect.headless:
-                body_start, sample = 0, header + sample
+                body_start, sample = body_start - len(header), header + sample
                 bad.headless = len(dialect.names)
             names = dialect.columns()
             rows_per_byte = max(sample.count(b"\n"), 1) / max(len(sample), 1)
@@ -264,7 +276,7 @@ def _read_csv(path: Path, most_cells: int, bad: BadRows, unused) -> RecordingTab
             if guess * len(names) <= 1.05 * most_cells:
                 kept = [(0, 1 << 62)]
             else:
-                kept = _kept_rows(guess, len(names), most_cells)
+                kept = kept_rows(guess, len(names), most_cells)
             file.seek(body_start)
             parts, rows, done = [], [], 0
             for text in blocks_of(file, dialect.quoted):
@@ -301,55 +313,6 @@ def _columns_of(
     return RecordingTable(columns, row, n_rows)
 
 
-def _read_npz(path: Path, most_cells: int, unused) -> RecordingTable:
-    try:
-        with zipfile.ZipFile(path) as archive:
-            size = sum(info.file_size for info in archive.infolist())
-        if size > MOST_BYTES:
-            raise ValueError(
-                f"recording {path} holds {size} bytes, expected at most {MOST_BYTES}: "
-                "cut it into several"
-            )
-        with np.load(path, allow_pickle=False) as file:
-            names = [name for name in file if name not in unused]
-            if not names:
-                raise ValueError(f"recording {path} has no columns")
-            columns: dict[str, np.ndarray] = {}
-            n, row = -1, np.empty(0, int)
-            for name in names:
-                value = file[name]
-                if not isinstance(value, np.ndarray):
-                    raise ValueError(f"recording {path}: {name} is no array")
-                if value.dtype.kind == "M":
-                    value = value.astype("datetime64[ns]").astype(np.int64) * 1e-9
-                if value.ndim not in (1, 2) or value.dtype.kind not in "iufb":
-                    raise ValueError(
-                        f"recording {path}: column {name} is {value.shape} of "
-                        f"{value.dtype}, expected one number a row"
-                    )
-                if n < 0:
-                    n = len(value)
-                    kept = _kept_rows(n, len(names), most_cells)
-                    row = np.concatenate([np.arange(a, b) for a, b in kept]) + 1
-                if len(value) != n:
-                    raise ValueError(
-                        f"recording {path}: column {name} has {len(value)} rows, "
-                        f"{names[0]} has {n}"
-                    )
-                value = value[row - 1].astype(float)
-                columns |= {name: value} if value.ndim == 1 else _spread(name, value)
-    except (OSError, zipfile.BadZipFile, EOFError, zlib.error) as error:
-        raise ValueError(f"recording {path} is no npz file: {error}") from None
-    except (MemoryError, NotImplementedError, RuntimeError, SyntaxError) as error:
-        why = " ".join(str(error).split())[:100]  # A header that lies, a cipher.
-        raise ValueError(f"recording {path} cannot be read: {why}") from None
-    except ValueError as error:
-        if str(path) in str(error):
-            raise
-        raise ValueError(f"recording {path} is no npz of numbers: {error}") from None
-    return _columns_of(path, columns, row, n)
-
-
 def _read_parquet(path: Path, most_cells: int, unused) -> RecordingTable:
     arrow = _pyarrow(path)
     parquet = import_module("pyarrow.parquet")
@@ -375,7 +338,7 @@ def _read_parquet(path: Path, most_cells: int, unused) -> RecordingTable:
             )
         names.append(field.name)
     n = file.metadata.num_rows
-    kept = _kept_rows(n, len(names), most_cells)
+    kept = kept_rows(n, len(names), most_cells)
     parts: dict[str, list[np.ndarray]] = {name: [] for name in names}
     done = 0
     for batch in file.iter_batches(batch_size=1 << 16, columns=names):
@@ -391,7 +354,7 @@ def _read_parquet(path: Path, most_cells: int, unused) -> RecordingTable:
     columns: dict[str, np.ndarray] = {}
     for name, part in parts.items():
         value = np.concatenate(part or empty)
-        columns |= {name: value} if value.ndim == 1 else _spread(name, value)
+        columns |= {name: value} if value.ndim == 1 else spread(name, value)
     row = np.concatenate([np.arange(a, b) for a, b in kept]) + 1
     return _columns_of(path, columns, row, n)
 
@@ -411,13 +374,6 @@ def _numbers(path: Path, arrow, name: str, value) -> np.ndarray:
         full = [[np.nan] * k if row is None else row for row in rows]
         return np.array(full, float).reshape(len(rows), -1)
     return value.cast(arrow.float64()).to_numpy(zero_copy_only=False)
-
-
-def _spread(name: str, value: np.ndarray) -> dict[str, np.ndarray]:
-    """Columns name[0], name[1], ... of (n, k) numbers."""
-    return {
-        f"{name}[{i}]": np.ascontiguousarray(value[:, i]) for i in range(value.shape[1])
-    }
 
 
 def _pyarrow(path: Path) -> ModuleType:

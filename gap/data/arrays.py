@@ -1,0 +1,259 @@
+"""Dictionaries of arrays as one table: .npz, MATLAB's .mat.
+
+What has a row for each instant is a column, whichever way round it lies; a number such
+as `dt` or `frequency` gives the time where no column does; a list of joints' names
+names the columns of arrays that are as wide. What is none of these is left out, and
+said.
+"""
+
+import re
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+STRETCHES = 20  # Of rows, of a table too long to keep.
+MOST_BYTES = 1 << 32  # Of an npz file's columns together, as they are in memory.
+FEWEST = 10  # Numbers in what may be a column.
+TIME_WORDS = set(
+    "time t timestamp timestamps stamp stamps ts sec secs seconds clock utime datetime "
+    "walltime epoch nsec nsecs usec usecs msec msecs nanoseconds microseconds "
+    "milliseconds tout".split()
+)
+# Scalars between two rows, and of rows a second, in small letters without signs.
+_PERIOD = re.compile(r"(\w*(time|step|control|sim|sample)_?)?(dt|period)|time_?step|"
+                     r"sampl(e|ing)_?time|ts")  # fmt: skip
+_RATE = re.compile(r"\w*(frequency|freq|hz|fs)|\w*(sampl(e|ing)|control|log)_?rate")
+_OF_A_BODY = set("quat quaternion root base imu pose foot feet contact".split())
+_PICKLES = (".pt", ".pth", ".pkl", ".pickle", ".joblib", ".npy")
+_HDF5 = (".h5", ".hdf5", ".hdf")
+ARRAYS = (".npz", ".mat")
+
+Read = tuple[dict[str, np.ndarray], np.ndarray, int, list[tuple[str, str]]]
+
+
+def words_of(name: str) -> list[str]:
+    """Lower-case words and numbers of a name, also of jointOne, q_1 and q[1]."""
+    name = re.sub(r"([a-z])([A-Z])", r"\1 \2", name)
+    return re.findall(r"[a-z]+|\d+", name.lower())
+
+
+def why_not(suffix: str) -> str:
+    """What to do with a file of another format; "" if there is nothing to say."""
+    if suffix in _PICKLES:
+        return (
+            "it holds pickled objects, which can run code when they are read: save its "
+            "arrays as npz, as in np.savez('log.npz', **{k: np.asarray(v) for k, v in "
+            "log.items()})"
+        )
+    if suffix in _HDF5:
+        return "HDF5 is not read: save its arrays with np.savez('log.npz', time=..., )"
+    return ""
+
+
+def kept_rows(n_rows: int, n_columns: int, most_cells: int) -> list[tuple[int, int]]:
+    """[first, last) rows, from 0, that are kept of a table of n_rows."""
+    most_rows = max(most_cells // max(n_columns, 1), STRETCHES)
+    if n_rows <= most_rows:
+        return [(0, n_rows)]
+    length, every = most_rows // STRETCHES, n_rows / STRETCHES
+    starts = [int((i + 0.5) * every - 0.5 * length) for i in range(STRETCHES)]
+    return [(start, start + length) for start in starts]
+
+
+def spread(name: str, value: np.ndarray) -> dict[str, np.ndarray]:
+    """Columns name[0], name[1], ... of (n, k) numbers."""
+    return {
+        f"{name}[{i}]": np.ascontiguousarray(value[:, i]) for i in range(value.shape[1])
+    }
+
+
+def read_npz(path: Path, most_cells: int, unused: frozenset[str]) -> Read:
+    """Columns (n,), numbers (n,) of their rows from 1, rows of the file, notes.
+
+    Raises: ValueError, one line.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(info.file_size for info in archive.infolist())
+        if size > MOST_BYTES:
+            raise ValueError(
+                f"recording {path} holds {size} bytes, expected at most {MOST_BYTES}: "
+                "cut it into several"
+            )
+        with np.load(path, allow_pickle=False) as file:
+            objects: list[str] = []
+
+            def load(name: str):
+                try:
+                    return file[name]
+                except ValueError as error:
+                    if "pickle" not in str(error):
+                        raise
+                    objects.append(name)  # Only they need pickles.
+                    return None
+
+            return _table(path, [n for n in file if n not in unused], load, most_cells)
+    except (OSError, zipfile.BadZipFile, EOFError, zlib.error) as error:
+        raise ValueError(f"recording {path} is no npz file: {error}") from None
+    except (MemoryError, NotImplementedError, RuntimeError, SyntaxError) as error:
+        why = " ".join(str(error).split())[:100]  # A header that lies, a cipher.
+        raise ValueError(f"recording {path} cannot be read: {why}") from None
+    except ValueError as error:
+        if str(path) in str(error):
+            raise
+        raise ValueError(f"recording {path} is no npz of numbers: {error}") from None
+
+
+def read_mat(path: Path, most_cells: int, unused: frozenset[str]) -> Read:
+    """The same of a MATLAB file of version 4 to 7.2; a struct's fields are
+    <struct>/<field>.
+
+    Raises: ValueError, one line.
+    """
+    from scipy.io import loadmat
+
+    try:
+        content = loadmat(path, simplify_cells=True)
+    except NotImplementedError:
+        raise ValueError(
+            f"recording {path} is a MATLAB file of version 7.3 (HDF5), which is not "
+            "read: save it again with save('log.mat', ..., '-v7')"
+        ) from None
+    except Exception as error:  # The library raises whatever its parser runs into.
+        why = " ".join(str(error).split())[:100] or type(error).__name__
+        raise ValueError(
+            f"recording {path} is no .mat file that can be read: {why}"
+        ) from None
+    own = {k: v for k, v in content.items() if not k.startswith("__")}
+    flat = {k: v for k, v in _leaves("", own) if k not in unused}
+    return _table(path, list(flat), flat.get, most_cells)
+
+
+def _leaves(name: str, value) -> Iterator[tuple[str, object]]:
+    """All arrays and numbers below a struct, or a list of structs."""
+    below = f"{name}/" if name else ""
+    if isinstance(value, dict):
+        for key, each in value.items():
+            yield from _leaves(f"{below}{key}", each)
+        return
+    is_list = isinstance(value, list) or getattr(value, "dtype", 0) == np.dtype("O")
+    some = list(value) if is_list and np.ndim(value) == 1 else []
+    if some and all(isinstance(each, dict) for each in some):
+        for i, each in enumerate(some):  # As Simulink's signals, with their labels.
+            own = str(each.get("label") or each.get("name") or i)
+            rest = {k: v for k, v in each.items() if k not in ("label", "name")}
+            yield from _leaves(f"{below}{own}", rest)
+        return
+    yield name, value
+
+
+def _table(path: Path, names: Sequence[str], load: Callable, most_cells: int) -> Read:
+    """Args: load: of a name an array, or None where it cannot be read."""
+    if not names:
+        raise ValueError(f"recording {path} has no columns")
+    shapes: dict[str, tuple[int, ...]] = {}
+    numbers: dict[str, float] = {}
+    labels: dict[int, tuple[str, ...]] = {}
+    lost: list[str] = []
+    for name in names:
+        value = load(name)
+        if isinstance(value, bytes):
+            raise ValueError(f"recording {path}: {name} is no array")
+        value = None if value is None else np.squeeze(np.asarray(value))
+        if value is not None and value.dtype == object and value.size:
+            if all(isinstance(each, str) for each in value.ravel()):
+                value = value.astype(str)
+        if value is None or value.dtype.kind not in "iufbMUS":
+            lost.append(name)
+        elif value.dtype.kind in "US":
+            if value.ndim == 1 and len(value) not in labels or _of_joints(name):
+                labels[value.size] = tuple(_text(each) for each in value.ravel())
+        elif value.ndim == 0:
+            numbers[name] = float(value) if value.dtype.kind != "M" else np.nan
+        else:
+            shapes[name] = value.shape
+    lengths = [n for shape in shapes.values() for n in shape[:2] if n >= FEWEST]
+    if not lengths:
+        raise ValueError(
+            f"recording {path} holds no array of numbers with {FEWEST} rows or more, "
+            f"got {', '.join(names[:8])}"
+            + (": objects, which need pickles or MATLAB" if lost else "")
+        )
+    times = [s[0] for name, s in shapes.items() if len(s) == 1 and is_time(name)]
+    n = max(times or lengths, key=lambda k: (lengths.count(k), k))
+    kept = kept_rows(n, sum(_width(s, n) for s in shapes.values()), most_cells)
+    row = np.concatenate([np.arange(a, b) for a, b in kept])
+    columns: dict[str, np.ndarray] = {}
+    for name, shape in shapes.items():
+        if not _width(shape, n):
+            lost.append(f"{name} {shape}")
+            continue
+        value = np.squeeze(np.asarray(load(name)))
+        if value.dtype.kind == "M":
+            value = value.astype("datetime64[ns]").astype(np.int64) * 1e-9
+        value = (value if shape[0] == n else value.T)[row].astype(float)
+        if value.ndim == 1:
+            columns[name] = value
+            continue
+        own = labels.get(value.shape[1])
+        if own is None or _OF_A_BODY & {*words_of(name)}:
+            columns |= spread(name, value)
+        else:
+            columns |= {f"{name}/{label}": value[:, i] for i, label in enumerate(own)}
+    notes = []
+    if lost:
+        says = f"{path.name}: left out, as they are no columns of {n} numbers: "
+        shown = ", ".join(lost[:8]) + (", ..." if lost[8:] else "")
+        notes.append(("not_columns", says + shown))
+    if not any(is_time(name) for name in columns):
+        notes += _with_time(path, columns, row, numbers)
+    return columns, row + 1, n, notes
+
+
+def is_time(name: str) -> bool:
+    """Whether the last part of a name has a word for time in it."""
+    return bool(TIME_WORDS & {*words_of(re.split(r"[/.]", name)[-1])})
+
+
+def _text(value) -> str:
+    text = value.decode(errors="replace") if isinstance(value, bytes) else str(value)
+    return text.strip()
+
+
+def _of_joints(name: str) -> bool:
+    return bool({"joint", "joints", "dof", "dofs", "motor"} & {*words_of(name)})
+
+
+def _width(shape: tuple[int, ...], n: int) -> int:
+    """How many columns of n numbers an array has; 0 if it has none."""
+    if n not in shape or len(shape) > 2:
+        return 0
+    return 1 if len(shape) == 1 else shape[1] if shape[0] == n else shape[0]
+
+
+def _with_time(
+    path: Path, columns: dict[str, np.ndarray], row, numbers: Mapping[str, float]
+) -> list[tuple[str, str]]:
+    """Puts `time` first, in place, where a number says how far apart rows are."""
+    for name, value in numbers.items():
+        last = re.split(r"[/.]", name)[-1].lower()
+        unit = next((u for end, u in (("_ms", 1e-3), ("_us", 1e-6), ("_ns", 1e-9))
+                     if last.endswith(end)), 1.0)  # fmt: skip
+        last = re.sub(r"_(s|ms|us|ns|sec)$", "", last)
+        if not value > 0.0:
+            continue
+        if _PERIOD.fullmatch(last):
+            period = unit * value
+        elif _RATE.fullmatch(last):
+            period = 1.0 / value
+        else:
+            continue
+        own = {"time": period * row, **columns}
+        columns.clear()
+        columns.update(own)
+        says = f"{path.name} has no times: its rows are {period:.6g} s apart, as its "
+        return [("time_of_period", f"{says}{name} ({value:g}) says")]
+    return []

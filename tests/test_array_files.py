@@ -1,0 +1,103 @@
+"""Dictionaries of arrays, .npz and .mat, and other files that people have."""
+
+import numpy as np
+import pytest
+from scipy.io import savemat
+
+from makebreak.gap.data.recording_files import recording_files
+from makebreak.gap.data.table import read_table
+
+N = 300
+TIME = 0.005 * np.arange(N)
+Q = np.sin(TIME[:, None] * [1.0, 2.0, 3.0])
+NAMES = ["hip", "knee", "ankle"]
+
+
+def test_a_dictionary_of_an_actuator_network_is_columns_with_joints_names(tmp_path):
+    """As Isaac Lab and PACE save them, once as npz."""
+    np.savez(
+        tmp_path / "a.npz", dof_pos=Q.astype(np.float32), des_dof_pos=2.0 * Q,
+        joint_names=np.array(NAMES), dt=np.float64(0.005), root_quat=np.ones((N, 4)),
+        task="walk", images=np.zeros((N, 4, 4)),
+    )  # fmt: skip
+    table = read_table(tmp_path / "a.npz")
+    np.testing.assert_allclose(table.columns["time"], TIME, atol=1e-12)
+    for i, name in enumerate(NAMES):
+        np.testing.assert_allclose(table.columns[f"des_dof_pos/{name}"], 2 * Q[:, i])
+    assert "root_quat[3]" in table.columns and len(table.columns) == 11
+    told = dict(table.notes)
+    assert "0.005 s apart" in told["time_of_period"]
+    assert "images (300, 4, 4)" in told["not_columns"]
+
+
+@pytest.mark.parametrize("number", [{"frequency": 200}, {"fs": 200.0}, {"dt_ms": 5},
+                                    {"sample_rate": 200}, {"step_dt": 0.005},
+                                    {"control_frequency_hz": 200}])  # fmt: skip
+def test_a_number_gives_the_time_where_no_column_does(tmp_path, number):
+    np.savez(tmp_path / "a.npz", q=Q, kp=40.0, **number)
+    np.testing.assert_allclose(read_table(tmp_path / "a.npz").columns["time"], TIME)
+    np.savez(tmp_path / "b.npz", q=Q, t=2.0 * TIME, **number)
+    assert "time" not in read_table(tmp_path / "b.npz").columns
+
+
+def test_a_mat_file_is_read_with_its_structs_either_way_round(tmp_path):
+    signals = np.zeros(2, dtype=[("values", "O"), ("label", "O")])
+    signals[0] = (Q[:, :1], "q_hip")
+    signals[1] = (Q[:, 1:2], "q_knee")
+    savemat(tmp_path / "a.mat", {
+        "log": {"t": TIME, "q": Q.T, "tau": 3.0 * Q, "note": "rig 2"},
+        "scope": {"signals": signals}, "Kp": np.diag([1.0, 2.0, 3.0]),
+    })  # fmt: skip
+    columns = read_table(tmp_path / "a.mat").columns
+    np.testing.assert_array_equal(columns["log/t"], TIME)
+    np.testing.assert_array_equal(columns["log/q[2]"], Q[:, 2])
+    np.testing.assert_array_equal(columns["log/tau[1]"], 3.0 * Q[:, 1])
+    np.testing.assert_array_equal(columns["scope/signals/q_knee/values"], Q[:, 1])
+
+
+HDF5 = b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + 400 * b"\0"
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "says"),
+    [
+        ("a.mat", HDF5, "version 7.3 .* '-v7'"),
+        ("a.mat", b"no such thing", "is no .mat file"),
+        ("a.pt", b"PK", r"pickled objects, .* save its arrays as npz"),
+        ("a.pkl", b"", r"pickled objects"),
+        ("a.hdf5", b"", r"HDF5 is not read: save its arrays with np.savez"),
+    ],
+)
+def test_what_is_not_read_is_one_line_that_says_what_to_do(
+    tmp_path, name, content, says
+):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ValueError, match=says) as error:
+        read_table(tmp_path / name)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("header", ["", "# t q_hip\n", "t   q_hip\n",
+                                    "% rig 2\n% t q_hip\n\n"])  # fmt: skip
+def test_a_text_with_blanks_is_read_as_numpy_and_matlab_write_it(tmp_path, header):
+    cells = zip(TIME, Q[:, 0], strict=True)
+    rows = "".join(f"  {t:.18e}   {q:.18e} \n" for t, q in cells)
+    (tmp_path / "a.txt").write_text(header + rows)
+    columns = read_table(tmp_path / "a.txt").columns
+    names = ["t", "q_hip"] if header else ["column_1", "column_2"]
+    assert list(columns) == names
+    np.testing.assert_array_equal(columns[names[1]], Q[:, 0])
+
+
+def test_patterns_and_folders_name_several_logs(tmp_path):
+    for name in ("b.csv", "a.csv", "c.npz", "notes.md", "b.yaml"):
+        (tmp_path / name).write_text("x")
+    names = [path.name for path in recording_files([str(tmp_path / "*.csv")])]
+    assert names == ["a.csv", "b.csv"]
+    names = [path.name for path in recording_files([str(tmp_path)])]
+    assert names == ["a.csv", "b.csv", "c.npz"]
+    (tmp_path / "empty").mkdir()
+    for word, says in (("empty", "folder without a log"), ("*.mat", "no log has"),
+                       ("d.csv", "does not exist")):  # fmt: skip
+        with pytest.raises(ValueError, match=says):
+            recording_files([str(tmp_path / word)])
