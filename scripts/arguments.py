@@ -247,6 +247,8 @@ def make_parser(functions: Mapping[str, Callable]) -> argparse.ArgumentParser:
         help="a log: .csv, .npz, .mat, .parquet, a ROS bag or a LeRobot dataset; a "
         "pattern ('runs/*.csv') or a folder names several",
     )
+    sidecar_help = "what the columns are (default: LOG.yaml, else another log's)"
+    p.add_argument("--sidecar", metavar="FILE", help=sidecar_help)
     p.add_argument(
         "--skip-bad-rows",
         action="store_true",
@@ -273,9 +275,13 @@ def make_parser(functions: Mapping[str, Callable]) -> argparse.ArgumentParser:
     )
     p.add_argument(
         "log",
+        nargs="+",
         metavar="LOG",
-        help="a log: .csv, .npz, .mat, .parquet, a ROS bag or a LeRobot dataset",
+        help="a log: .csv, .npz, .mat, .parquet, a ROS bag or a LeRobot dataset; a "
+        "pattern or a folder names several",
     )
+    p.add_argument("--sidecar", metavar="FILE", help=sidecar_help)
+    p.add_argument("--json", action="store_true", help="print all of it as JSON")
     p.add_argument(
         "--robot",
         metavar="FILE",

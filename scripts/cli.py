@@ -188,7 +188,7 @@ def _gap(args) -> int:
 
 
 def _gap_until(args, interrupt, drake) -> int:
-    from makebreak.gap.data.recording_files import recording_files
+    from makebreak.gap.data.recording_files import ROBOTS, recording_files
     from makebreak.gap.data.table import has_table
     from makebreak.scripts.gap_command import effects_table, run_and_report
 
@@ -199,7 +199,7 @@ def _gap_until(args, interrupt, drake) -> int:
             f"{robot} is a recording, expected the scene or robot first: "
             "makebreak gap SCENE RECORDING"
         )
-    is_robot = robot.suffix.lower() in (".urdf", ".sdf", ".xml", ".xacro")
+    is_robot = robot.suffix.lower() in ROBOTS
     scene = robot if is_robot else Path(scene_file(args.scene, "SCENE"))
     out = Path(args.out) if args.out else default_out("gap")
     export = [word for word in (args.export or "").split(",") if word]
@@ -207,7 +207,7 @@ def _gap_until(args, interrupt, drake) -> int:
         result, files, notes, is_interrupted = run_and_report(
             scene, recordings, out, number_of_processes(args.jobs), export, is_robot,
             args.skip_bad_rows, number(args.budget, "--budget", 0.0),
-            lambda: interrupt.hit, drake,
+            lambda: interrupt.hit, drake, Path(args.sidecar) if args.sidecar else None,
         )  # fmt: skip
     except (Exception, SystemExit) as error:
         if on_purpose(error) or isinstance(error, OSError):
@@ -223,20 +223,27 @@ def _gap_until(args, interrupt, drake) -> int:
 
 
 def _inspect(args) -> int:
+    import json
+
     from makebreak.scripts.inspect_command import run_inspect, run_repair
 
     robot = Path(args.robot) if args.robot else None
     out = Path(args.out) if args.out else None
     if args.repair:
-        lines, files = run_repair(Path(args.log), out)
+        lines, files = run_repair(Path(args.log[0]), out)
         print("\n".join(lines))
         print_files(files)
         return 0
-    table, sidecar, files = run_inspect(Path(args.log), robot, out)
-    print(table.to_text())
+    given = Path(args.sidecar) if args.sidecar else None
+    found, files = run_inspect(args.log, robot, out, given)
+    if args.json:
+        print(json.dumps(found.to_dict(), indent=2))
+        return 0
+    for table in found.tables():
+        print(table.to_text())
     if out is None:
         print("\nProposed sidecar; check it (--out DIR writes it to a file):\n")
-        print(sidecar, end="")
+        print("\n".join(found.sidecars()), end="")
     else:
         print_files(files)
     return 0

@@ -11,12 +11,13 @@ from pathlib import Path
 from shlex import quote
 from time import perf_counter
 
+import yaml
 from tqdm import tqdm
 
 from makebreak.gap.budget import REPORT, Budget
 from makebreak.gap.data.findings import NO_COLUMN, Finding
 from makebreak.gap.data.reading import read_recordings
-from makebreak.gap.data.sidecar import has_sidecar, sidecar_of
+from makebreak.gap.data.sidecar import has_sidecar, has_sidecars, sidecar_of
 from makebreak.gap.report.comparison import comparison_html
 from makebreak.gap.report.files import write_report
 from makebreak.gap.report.summary import next_best, summary_lines, windows_of
@@ -102,6 +103,7 @@ def run_and_report(
     budget_min: float = BUDGET_MIN,
     interrupted: Callable[[], bool] = lambda: False,
     drake: DrakeLog | None = None,
+    sidecar: Path | None = None,
 ) -> tuple[GapResult, list[Path], list[str], bool]:
     """The workflow's result, the files written, notes for the user, and whether it was
     interrupted.
@@ -112,21 +114,22 @@ def run_and_report(
         written too. budget_min: minutes after which the best answer so far is
         written; interrupted: whether it is to be written as soon as possible. drake:
         collects what Drake says; what changes the motion is told with the checks.
+        sidecar: of all recordings, in place of their own.
     Raises: ValueError for a scene, a recording or a folder that cannot be used.
     """
     start = perf_counter()
     given = scene_path
     inputs = [scene_path, *recording_paths]
     doubts: Sequence[Finding] = ()
-    sidecars = {} if is_robot else sidecars_beside(scene_path, recording_paths)
-    notes = [f"{log.name}: columns as in {own}" for log, own in sidecars.items()]
     seconds = 60.0 * budget_min
     with OutputFolder(out_dir, "gap", inputs) as out:
         if is_robot:
             scene_path, sidecars, notes, doubts = _proposed(
-                scene_path, recording_paths, out, out_dir
+                scene_path, recording_paths, out, out_dir, sidecar
             )
             print_files(out.keep(), sys.stderr)
+        else:
+            sidecars, notes = known_sidecars(scene_path, recording_paths, out, sidecar)
         if export:  # Raises before anything is computed.
             exported(read_scene(scene_path), export)
         from makebreak.gap.workflow import run_gap  # Here, as it takes long to import.
@@ -181,25 +184,46 @@ def run_and_report(
         return result, files, notes, budget.is_interrupted
 
 
-def sidecars_beside(
-    scene_path: Path, recording_paths: Sequence[Path]
-) -> dict[Path, Path]:
-    """{recording: sidecar in the scene's folder} for recordings without a sidecar of
-    their own: a proposal writes scene and sidecars into one folder."""
-    found = {}
+def known_sidecars(
+    scene_path: Path, recording_paths: Sequence[Path], out: OutputFolder, given
+) -> tuple[dict[Path, Path], list[str]]:
+    """{recording: sidecar} for recordings without a sidecar of their own: one of this
+    name in the scene's folder, where a proposal is written; else that of another log
+    of the robot, which is written for this one. And what is to be said of it.
+
+    Args: given: in place of any other.
+    """
+    from makebreak.gap.data.robot import read_log
+
+    found, notes = dict[Path, Path](), list[str]()
     for path in recording_paths:
         near = scene_path.parent / sidecar_of(path).name
-        if has_sidecar(path) or not near.is_file() or near.samefile(scene_path):
+        if given is None and has_sidecar(path):
             continue
-        with suppress(ValueError):
-            content = read_yaml(near)
-            if isinstance(content, dict) and "columns" in content:
-                found[path] = near
-    return found
+        if given is None and near.is_file() and not near.samefile(scene_path):
+            with suppress(ValueError):
+                content = read_yaml(near)
+                if isinstance(content, dict) and "columns" in content:
+                    found[path] = near
+                    notes.append(f"{path.name}: columns as in {near}")
+                    continue
+        folders = (path.parent, scene_path.parent)
+        if given is None and not any(map(has_sidecars, folders)):
+            continue
+        own = read_log(path, given, folders).sidecar
+        notes += own.notes
+        if own.sections:
+            found[path] = out.file(sidecar_of(path).name)
+            found[path].write_text(yaml.safe_dump(dict(own.sections), sort_keys=False))
+    return found, notes
 
 
 def _proposed(
-    robot_path: Path, recording_paths: Sequence[Path], out: OutputFolder, out_dir: Path
+    robot_path: Path,
+    recording_paths: Sequence[Path],
+    out: OutputFolder,
+    out_dir: Path,
+    sidecar: Path | None,
 ) -> tuple[Path, dict[Path, Path], list[str], list[Finding]]:
     """Writes a proposed scene and sidecars for a robot and its logs.
 
@@ -209,7 +233,9 @@ def _proposed(
     from makebreak.gap.data.robot import propose_scene, read_log, read_robot
 
     robot = read_robot(robot_path)
-    proposal = propose_scene(robot, [read_log(path) for path in recording_paths])
+    proposal = propose_scene(
+        robot, [read_log(path, sidecar) for path in recording_paths]
+    )
     scene = out.file("proposed_scene.yaml")
     scene.write_text(proposal.scene)
     for name, text in proposal.copies.items():

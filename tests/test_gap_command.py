@@ -3,6 +3,7 @@
 import json
 import re
 import sys
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 
@@ -10,7 +11,7 @@ import pytest
 from test_gap_report import made_by_hand, small_case
 
 from makebreak.scripts import cli
-from makebreak.scripts.gap_command import StageBar, effects_table, sidecars_beside
+from makebreak.scripts.gap_command import StageBar, effects_table, known_sidecars
 
 
 @pytest.fixture(scope="module")
@@ -158,11 +159,12 @@ def test_a_sidecar_beside_the_scene_serves_a_log_without_its_own(tmp_path):
     near = scene.with_name("log.yaml")
     near.write_text("columns:\n  t: time\n")
     scene.write_text("directives: []\n")
-    assert sidecars_beside(scene, [log]) == {log: near}
+    known = partial(known_sidecars, out=None, given=None)  # It writes nothing here.
+    assert known(scene, [log])[0] == {log: near}
     # Its own wins; a scene is no sidecar, nor is the given one.
     log.with_suffix(".yaml").write_text("columns: {t: time}\n")
-    assert sidecars_beside(scene, [log]) == {}
+    assert known(scene, [log]) == ({}, [])
     log.with_suffix(".yaml").unlink()
     near.write_text("directives: []\n")
-    assert sidecars_beside(scene, [log]) == {}
-    assert sidecars_beside(near, [log]) == {}
+    assert known(scene, [log]) == ({}, [])
+    assert known(near, [log]) == ({}, [])

@@ -7,6 +7,8 @@ from pathlib import Path
 from makebreak.gap.data.bags import BAGS, is_bag, is_dataset
 from makebreak.gap.data.table import has_table
 
+ROBOTS = (".urdf", ".sdf", ".xml", ".xacro")  # A robot's own file.
+
 
 def recording_files(words: Iterable[str]) -> list[Path]:
     """Each recording, sorted where a pattern or a folder names several.

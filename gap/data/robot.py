@@ -39,7 +39,7 @@ from makebreak.gap.data.servo_gains import (
     effort_shares,
     servo_gains,
 )
-from makebreak.gap.data.sidecar import own_sections, read_sidecars
+from makebreak.gap.data.sidecar import Found, read_sidecars, sidecar_for
 from makebreak.gap.data.table import (
     RecordingTable,
     is_channel,
@@ -206,19 +206,28 @@ def _with_fixed(robot: Robot, fixed: Mapping[str, float]) -> Robot:
 @dataclass(frozen=True, eq=False)
 class Log:
     """A log as it is: the table of its numbers, columns of text with what is in all
-    their cells, and what its own sidecar says."""
+    their cells, what its sidecar says, and which that is."""
 
     path: Path
     table: RecordingTable
     text: Mapping[str, str] = field(default_factory=dict)
     own: Mapping[str, Any] = field(default_factory=dict)
+    sidecar: Found = Found({})
 
 
-def read_log(path: Path) -> Log:
-    """Raises: ValueError, one line, for a file that cannot be read."""
-    sidecar = read_sidecars(path, None)
-    table, text = read_joined(path, sidecar, with_text=True)
-    return Log(path, table, text, own_sections(path))
+def read_log(
+    path: Path, sidecar: Path | None = None, folders: Sequence[Path] = ()
+) -> Log:
+    """Args: sidecar: in place of the one beside it; folders: where else sidecars of
+        other logs may lie.
+    Raises: ValueError, one line, for a file that cannot be read, or a sidecar that does
+        not fit it.
+    """
+    own = read_sidecars(path, None) if sidecar is None else {}
+    table, text = read_joined(path, own, with_text=True)
+    unused = [k for k, to in (own.get("columns") or {}).items() if to is None]
+    found = sidecar_for(path, [*table.columns, *text, *unused], sidecar, folders)
+    return Log(path, table, text, found.sections, found)
 
 
 def matches_of(log: Log, robot: Robot | None) -> list[Match]:
@@ -300,12 +309,21 @@ class Proposal:
         return says + ". If the log has these positions, name them in the sidecar."
 
 
-def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
-    """Base welded, columns matched by name, actuation by the commands there are.
-    Collision meshes that are not there are left out, as the robot touches nothing.
+@dataclass(frozen=True)
+class Judged:
+    """Logs' columns by their names and by what is in them. robot: without joints that
+    are taken to stand still, fixed {joint: where}. unused: columns of quantities of
+    unknown joints. said: what contents say beside names."""
 
-    Raises: ValueError where no joint's position or no time is found.
-    """
+    robot: Robot
+    every: dict[Path, list[Match]]
+    fixed: dict[str, float]
+    unused: tuple[str, ...]
+    said: tuple[Said, ...]
+
+
+def judge_logs(robot: Robot, logs: Sequence[Log]) -> Judged:
+    """Raises: ValueError for coupled joints that carry others."""
     every = {log.path: matches_of(log, robot) for log in logs}
     unused = dict.fromkeys(m.column for matches in every.values() for m in matches
                            if m.why.endswith(UNKNOWN_JOINT))  # fmt: skip
@@ -321,6 +339,17 @@ def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
         )
         every[log.path] = of_one_drive(matches)
         said += [each for each in more if each not in said]
+    return Judged(robot, every, fixed, tuple(unused), tuple(said))
+
+
+def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
+    """Base welded, columns matched by name, actuation by the commands there are.
+    Collision meshes that are not there are left out, as the robot touches nothing.
+
+    Raises: ValueError where no joint's position or no time is found.
+    """
+    judged = judge_logs(robot, logs)
+    robot, every, fixed = judged.robot, judged.every, judged.fixed
     kinds: dict[str, list[str]] = {}
     for path, matches in every.items():
         channels = {m.channel for m in matches if m.channel}
@@ -378,6 +407,7 @@ def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
     own = "" if gravity == [0.0, 0.0, -9.81] else f", gravity: {gravity}"
     lines += [f"plant: {{time_step: 0.001{own}}}", *actuation]
     lines += _effects_of_file(robot, fixed, lines)
+    notes += [says for log in logs for says in log.sidecar.notes]
     notes += [f"{robot.path.name}: {note}" for note in robot.file.notes]
     sidecars = {
         log.path: sidecar_text(every[log.path], log.own)
@@ -394,12 +424,12 @@ def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
         gains,
         is_driven,
         without,
-        tuple(unused),
+        judged.unused,
         tuple(fixed),
         stem_of(logs[0].path),
         copies,
         robot.file.notes,
-        tuple(said),
+        judged.said,
     )
 
 
@@ -478,8 +508,10 @@ def _check_currents(
 def _says_all(log: Log) -> bool:
     """Whether a log's own sidecar needs no proposal beside it."""
     said = log.own.get("columns") or {}
-    return bool(log.own) and all(
-        name in said or is_channel(name) for name in log.table.columns
+    return (
+        bool(log.own)
+        and log.sidecar.is_own
+        and all(name in said or is_channel(name) for name in log.table.columns)
     )
 
 

@@ -2,8 +2,11 @@
 out, files to join."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -14,6 +17,7 @@ from makebreak.gap.data.table import stem_of
 _SECTIONS = (
     "noise", "filters", "columns", "wrench", "ignore", "join", "provenance",
 )  # fmt: skip
+_OF_ONE_LOG = ("ignore", "join", "provenance")
 
 
 def sidecar_of(path: Path) -> Path:
@@ -26,6 +30,16 @@ def has_sidecar(path: Path) -> bool:
     return bool(_own_sidecars(path))
 
 
+def has_sidecars(folder: Path) -> bool:
+    """Whether a file in a folder names columns, as sidecars do."""
+    for file in folder.glob("*.y*ml"):
+        with suppress(ValueError, OSError):
+            sections = _sections(file) or {}
+            if "columns" in sections and set(sections) <= {*_SECTIONS}:
+                return True
+    return False
+
+
 def own_sections(path: Path) -> dict:
     """{section: as written} of the sidecar beside a recording, with whole paths of
     joined files; none: {}.
@@ -36,6 +50,95 @@ def own_sections(path: Path) -> dict:
     own = _own_sidecars(path)
     found = (_sections(own[0]) or {}) if own else {}
     return found | ({"join": [str(file.resolve()) for file in join]} if join else {})
+
+
+@dataclass(frozen=True)
+class Found:
+    """The sidecar that is used for a log. sections: as written; file: where they are,
+    None where there is none; is_own: whether it speaks of this log alone. notes: what
+    is to be said of it."""
+
+    sections: Mapping[str, Any]
+    file: Path | None = None
+    is_own: bool = True
+    notes: tuple[str, ...] = ()
+
+
+def sidecar_for(
+    path: Path,
+    columns: Collection[str],
+    given: Path | None = None,
+    folders: Sequence[Path] = (),
+) -> Found:
+    """The sidecar that is given, else that beside the log, else one of another log,
+    beside it or in `folders`, whose columns this log has, too: logs of one robot.
+
+    Args: columns: all that the log has, columns of text too.
+    Raises: ValueError, one line, for one that is given, or beside the log, and names
+        columns that the log lacks.
+    """
+    own = _own_sidecars(path)
+    if given is not None:
+        sections = _sections(given) if given.is_file() else None
+        if sections is None:
+            raise ValueError(f"sidecar {given} does not exist, or nothing is in it")
+        sections = {k: x for k, x in sections.items() if k not in _OF_ONE_LOG}
+        if lacking := _lacking(sections, columns):
+            raise ValueError(
+                f"sidecar {given} does not fit {path.name}: it names "
+                f"{', '.join(lacking[:3])}; {path.name} has {', '.join(columns)}"
+            )
+        return Found(sections, given, False, (f"{path.name}: columns as in {given}",))
+    if own:
+        sections = own_sections(path)
+        if lacking := _lacking(sections, columns):
+            raise ValueError(
+                f'{own[0]}: columns names "{lacking[0]}", {path.name} has '
+                f"{', '.join(columns)}"
+            )
+        return Found(sections, own[0])
+    fits: dict[Path, dict] = {}
+    notes = []
+    for folder in dict.fromkeys(each.resolve() for each in (path.parent, *folders)):
+        for file in sorted(folder.glob("*.y*ml")):
+            try:
+                sections = _sections(file) or {}
+            except (ValueError, OSError):
+                continue
+            named = sections.get("columns")
+            if set(sections) - {*_SECTIONS} or not isinstance(named, dict):
+                continue  # No sidecar.
+            named = {str(k): to for k, to in named.items()}
+            lacking = _lacking(sections, columns)
+            if not lacking and any(key in columns for key in named):
+                fits[file] = {k: x for k, x in sections.items() if k not in _OF_ONE_LOG}
+            elif len(lacking) < 0.5 * len(named):
+                notes.append(
+                    f"{path.name}: {file.name} is not used, as it names {lacking[0]}, "
+                    "which this log lacks"
+                )
+    if not fits:
+        return Found({}, notes=tuple(notes))
+    first = next(iter(fits))
+    if any(each != fits[first] for each in fits.values()):
+        says = ", ".join(file.name for file in fits)
+        notes.append(
+            f"{path.name}: sidecars of other logs fit and contradict each other: {says}"
+            "; none is used (--sidecar FILE chooses one)"
+        )
+        return Found({}, notes=tuple(notes))
+    says = (
+        f"{path.name} has no sidecar: columns as in {first.name}, that of another log"
+    )
+    return Found(fits[first], first, False, (*notes, says))
+
+
+def _lacking(sections: Mapping, columns: Collection[str]) -> list[str]:
+    """Columns that a sidecar says something of and a log does not have."""
+    named = sections.get("columns") or {}
+    return [
+        str(k) for k, to in named.items() if to is not None and str(k) not in columns
+    ]
 
 
 def _own_sidecars(path: Path) -> list[Path]:
