@@ -10,6 +10,13 @@ from makebreak.models.typed_yaml import nearest
 BUDGET_MIN = 10.0  # Of `gap`.
 
 
+# Of every command.
+_TELLING = {
+    "--json": "print one JSON document, with tables and files; the rest goes to stderr",
+    "--quiet": "print nothing but errors; no progress",
+}
+
+
 class CommandParser(argparse.ArgumentParser):
     """argparse, but with one line on stderr where the input is wrong, and no shortened
     options: --seed of `run` is not --seeds of `reproduce`."""
@@ -270,6 +277,21 @@ def make_parser(functions: Mapping[str, Callable]) -> argparse.ArgumentParser:
     )
 
     p = commands.add_parser(
+        "judge", help="measure how well scenes predict recordings, without any fit"
+    )
+    p.add_argument(
+        "scenes", nargs="+", metavar="SCENE", help="scenes, as before and after `gap`"
+    )
+    p.add_argument(
+        "--on", nargs="+", required=True, metavar="RECORDING",
+        help="recordings, that `gap` has not seen",
+    )  # fmt: skip
+    p.add_argument(
+        "--window", default="0.4", metavar="S",
+        help="seconds that are predicted from each measured state (0.4)",
+    )  # fmt: skip
+
+    p = commands.add_parser(
         "inspect",
         help="show the columns or topics of a log, with rates, missing samples, units",
     )
@@ -358,6 +380,13 @@ def make_parser(functions: Mapping[str, Callable]) -> argparse.ArgumentParser:
             "--package", action="append", default=[], metavar="NAME=PATH",
             help="folder that package://NAME in model files stands for",
         )  # fmt: skip
+    for name, each in commands.choices.items():
+        if name == "completion":
+            continue
+        own = each._option_string_actions
+        for option, says in _TELLING.items():
+            if option not in own:
+                each.add_argument(option, action="store_true", help=says)
     for line in commands._choices_actions:  # Above a command's own options too.
         commands.choices[line.dest].description = f"{_sentence(line.help)}."
     for name, each in commands.choices.items():

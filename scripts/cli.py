@@ -25,10 +25,11 @@ from makebreak.scripts.command_inputs import (
 )
 from makebreak.scripts.faults import fault, is_drakes, on_purpose, refused
 from makebreak.scripts.interrupts import CatchInterrupt, interrupts
-from makebreak.scripts.outputs import check_written, default_out, print_files
+from makebreak.scripts.outputs import check_written, default_out
 from makebreak.scripts.parent import end_with_parent
 from makebreak.scripts.run_command import run, station
 from makebreak.scripts.settings import apply_settings
+from makebreak.scripts.shown import print_files, show, tell, telling
 
 # Benchmarks that `reproduce` runs only where they are named.
 _BENCHMARKS = {
@@ -53,24 +54,31 @@ def fault_lines() -> dict[str, str]:
 
 def _list(args) -> int:
     if args.experiment is not None:
-        from makebreak.scripts.settings_list import settings_text
+        from makebreak.scripts.settings_list import matching_rows, settings_text
 
         config = experiment_module(args.experiment).Config()
         width = get_terminal_size().columns if sys.stdout.isatty() else None
         print(settings_text(args.experiment, config, args.text, width))
+        rows = matching_rows(args.experiment, config, args.text)
+        tell(
+            settings=[
+                dict(zip(("key", "default", "says"), r, strict=True)) for r in rows
+            ]
+        )
         return 0
-    names: dict[str, dict[str, str]] = {"experiments": {}, "scenes": {}}
+    groups: dict[str, dict[str, str]] = {"experiments": {}, "scenes": {}}
     for name in experiments.EXPERIMENTS:
         try:
-            names["experiments"][name] = experiments.summary_of(name)
+            groups["experiments"][name] = experiments.summary_of(name)
         except ImportError as error:
-            names["experiments"][name] = f"(cannot be loaded: {error})"
+            groups["experiments"][name] = f"(cannot be loaded: {error})"
     for name, path in scenes().items():
         first = path.read_text().splitlines()[0]
-        names["scenes"][name] = first.lstrip("# ") if first.startswith("#") else ""
-    names["faults"] = fault_lines()
-    width = max((len(n) for group in names.values() for n in group), default=0)
-    for group, lines in names.items():
+        groups["scenes"][name] = first.lstrip("# ") if first.startswith("#") else ""
+    groups["faults"] = fault_lines()
+    tell(**groups)
+    width = max((len(n) for group in groups.values() for n in group), default=0)
+    for group, lines in groups.items():
         print(f"{group}:")
         for name, line in lines.items():
             print(f"  {name:{width}}  {line}".rstrip())
@@ -121,9 +129,9 @@ def _reproduce_in(session, modules, seeds: int, jobs: int, args, seed) -> int:
 
     tables = {}
 
-    def show(name, table):
+    def tell_of(name, table):
         tables[name] = table
-        print(table.to_text(), flush=True)
+        show(table)
         # Written after each: an interrupted run keeps what is done.
         session.write_json(
             "reproduce.json", {n: t.to_dict() for n, t in tables.items()}
@@ -141,10 +149,10 @@ def _reproduce_in(session, modules, seeds: int, jobs: int, args, seed) -> int:
                 except (Exception, SystemExit) as error:
                     return fault(error)  # All input is checked above.
                 child.finish()
-            show(name, table)
+            tell_of(name, table)
     verdict = verdicts(tables)
     if verdict is not None:
-        show("hypotheses", verdict)
+        tell_of("hypotheses", verdict)
     missed = sum(t.missed for name, t in tables.items() if name != "hypotheses")
     if missed:
         print(f"makebreak: {missed} rows miss their target", file=sys.stderr)
@@ -175,7 +183,7 @@ def _sweep(args) -> int:
         sweep, out, number_of_processes(args.jobs), args.cluster, inputs=inputs
     )
     is_wide = len(table.columns) > len(table.rows) + 1
-    print((table.transposed() if is_wide else table).to_text())
+    show(table, table.transposed() if is_wide else None)
     print_files(files)
     return 1 if table.notes else 0  # A note: a trial failed.
 
@@ -214,12 +222,21 @@ def _gap_until(args, interrupt, drake) -> int:
             raise
         kept = out / "error.txt"
         return fault(error, kept) if kept.exists() else refused(error)
-    print(effects_table(result).to_text())
+    show(effects_table(result))
     for note in notes:
         print(note)
     drake.show()
     print_files(files)
     return 130 if is_interrupted else 0
+
+
+def _judge(args) -> int:
+    from makebreak.scripts.judge import judge_scenes
+
+    window = number(args.window, "--window", 0.0)
+    scenes = [t if Path(t).is_file() else scene_file(t, "SCENE") for t in args.scenes]
+    show(judge_scenes(scenes, [Path(text) for text in args.on], window))
+    return 0
 
 
 def _inspect(args) -> int:
@@ -285,7 +302,7 @@ def _close_the_loop(args) -> int:
     except RuntimeError as failed:
         print(f"makebreak: {failed}", file=sys.stderr)
         return 3
-    print(table.to_text())
+    show(table)
     print(f"Files in {out}: loop.json; open {out / '2_gap' / 'report.html'}")
     return 1 if table.missed else 0
 
@@ -301,6 +318,7 @@ def _export_tests(args) -> int:
     done, left_out = export_tests(
         args.experiment, module, config, out, wanted, seconds, input_files(args, config)
     )
+    tell(updates=done, left_out=left_out, folder=str(out))
     for name, updates in done.items():
         print(f"test_{name}.py  {updates} updates")
     for name, reason in left_out.items():
@@ -339,7 +357,7 @@ def _bench(args) -> int:
     from makebreak.scripts.bench import bench
 
     table = bench(args.names)
-    print(table.to_text())
+    show(table)
     print(json.dumps(table.to_dict(), indent=2))
     return 1 if table.missed else 0  # A bench that failed is a missed row.
 
@@ -358,6 +376,7 @@ _COMMANDS: dict[str, Callable[[Namespace], int]] = {
     "reproduce": _reproduce,
     "sweep": _sweep,
     "gap": _gap,
+    "judge": _judge,
     "inspect": _inspect,
     "close-the-loop": _close_the_loop,
     "export-tests": _export_tests,
@@ -406,8 +425,12 @@ def _main(argv: list[str], is_trial: bool) -> int:
             for setting in args.set:
                 if setting in experiments.EXPERIMENTS:
                     raise ValueError(f"EXPERIMENT comes before --set, got {setting}")
-        with _given_packages(getattr(args, "package", [])):
+        with (
+            _given_packages(getattr(args, "package", [])),
+            telling(argv[0], args) as ended,
+        ):
             status = args.function(args)
+            ended(status)
         sys.stdout.flush()
         return status
     except ValueError as error:

@@ -10,7 +10,6 @@ scene as its model. Nothing else passes from one step to the next.
 
 import json
 import re
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from makebreak.diagrams.station import BALL_ROLLING
 from makebreak.models.scene import load_scene, read_scene
 from makebreak.models.scene_file import write_scene
 from makebreak.scripts.outputs import OutputFolder
+from makebreak.scripts.shown import say
 from makebreak.scripts.table import Table
 from makebreak.scripts.trials import makebreak_command, run_commands
 
@@ -116,7 +116,7 @@ def take_step(out: Path, folder: str, says: str, *words: str) -> dict:
 
     Raises: ValueError if it refuses its input, RuntimeError without a result.
     """
-    print(says, file=sys.stderr, flush=True)
+    say(says)
     command = makebreak_command(*words, "--out", str(out / folder))
     [result] = run_commands(folder, [command], [out / folder], 1)
     if "error" in result:

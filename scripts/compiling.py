@@ -1,9 +1,10 @@
 """Shows what Numba compiles, which takes a minute or two the first time."""
 
-import sys
 from collections.abc import Callable
 
 from numba.core import event
+
+from makebreak.scripts.shown import say
 
 FIRST = "Compiling, the first time only: a minute or two of one core"
 
@@ -30,7 +31,7 @@ class CompilingShown:
         if self._depth > 1 or not function.__module__.startswith("makebreak."):
             return
         if self._first:
-            print(FIRST, file=sys.stderr, flush=True)
+            say(FIRST)
             self._first = False
             self._at_first()
         module = function.__module__.rpartition(".")[2]

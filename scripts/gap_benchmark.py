@@ -29,6 +29,7 @@ from makebreak.scripts.gap_scoring import (
     table_of,
 )
 from makebreak.scripts.session import Session
+from makebreak.scripts.shown import is_quiet
 from makebreak.scripts.table import Table, json_value
 from makebreak.scripts.trials import makebreak_command, run_commands
 
@@ -168,7 +169,9 @@ def _make_cases(
     process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     try:
-        with tqdm(desc="recordings", unit="case", file=sys.stderr) as bar:
+        with tqdm(
+            desc="recordings", unit="case", file=sys.stderr, disable=is_quiet()
+        ) as bar:
             for _ in process.stdout:
                 bar.update()
         if process.wait() != 0:

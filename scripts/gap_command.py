@@ -27,7 +27,8 @@ from makebreak.models.typed_yaml import read_yaml
 from makebreak.scripts.arguments import BUDGET_MIN
 from makebreak.scripts.drake_log import DrakeLog
 from makebreak.scripts.interrupts import undisturbed
-from makebreak.scripts.outputs import OutputFolder, print_files
+from makebreak.scripts.outputs import OutputFolder
+from makebreak.scripts.shown import is_quiet, print_files
 from makebreak.scripts.table import Table
 
 EXPORTS = ("urdf", "mjcf")
@@ -54,7 +55,7 @@ class StageBar:
             bar_format=f"{{elapsed}}{most}  {{desc}}",
             dynamic_ncols=tty,
             ncols=None if tty else 100,
-            disable=not shown,
+            disable=is_quiet() or not shown,
             file=sys.stderr,
         )
         self._shown_at = perf_counter()

@@ -5,11 +5,10 @@ import fcntl
 import json
 import os
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from datetime import datetime
 from hashlib import sha256
 from pathlib import Path
-from typing import TextIO
 
 MARK = ".makebreak.json"  # Names the command that wrote the folder, and its files.
 STAGE = ".unfinished"  # Folder in which files are written before they are moved.
@@ -314,15 +313,6 @@ def default_out(name: str) -> Path:
         n += 1
         path = Path("runs") / f"{stem}-{n}"
     return path
-
-
-def print_files(files: Sequence[Path], to: TextIO | None = None) -> None:
-    """Prints which files were written, and where: in their common folder, as an
-    interrupted run may have a subfolder. to: None: the standard output."""
-    if files:
-        folder = Path(os.path.commonpath([path.parent for path in files]))
-        names = " ".join(path.relative_to(folder).as_posix() for path in files)
-        print(f"Files in {folder}: {names}", flush=True, file=to)
 
 
 def check_written(session) -> None:

@@ -14,8 +14,9 @@ from makebreak.scripts.command_inputs import (
     input_files,
 )
 from makebreak.scripts.faults import fault, refused
-from makebreak.scripts.outputs import check_written, default_out, print_files
+from makebreak.scripts.outputs import check_written, default_out
 from makebreak.scripts.settings import dump_config
+from makebreak.scripts.shown import is_quiet, print_files, show
 
 
 def run(args) -> int:
@@ -105,7 +106,8 @@ def run_in(session, args, experiment, config, duration) -> int:
     if session.interrupted:
         print("makebreak: interrupted; what was recorded is kept", file=sys.stderr)
         return 130
-    if session.meshcat is not None and sys.stdin is not None and sys.stdin.isatty():
+    is_asked = sys.stdin is not None and sys.stdin.isatty() and not is_quiet()
+    if session.meshcat is not None and is_asked:
         try:
             input("Meshcat stays open; press Enter to leave")
         except (EOFError, KeyboardInterrupt):
@@ -165,7 +167,7 @@ def _print_outcome(session, name: str, result: dict | None, files) -> None:
 
     if result is not None:
         rows = [(k, v) for k, v in result.items() if k not in ("criteria", "ended")]
-        print(Table(name, ("result", "value"), rows).to_text())
+        show(Table(name, ("result", "value"), rows))
         lines = [*session.endings, *session.too_slow(), success_text(result)]
         print("\n".join(lines), flush=True)
     print_files(files)
@@ -218,7 +220,7 @@ def station(args) -> int:
     with CatchInterrupt() as interrupt:
         stand_in.run(duration, lambda: interrupt.hit)
     result = stand_in.report.result()
-    print(Table("station", ("result", "value"), list(result.items())).to_text())
+    show(Table("station", ("result", "value"), list(result.items())))
     plain = {key: json_value(value) for key, value in result.items()}
     print(json.dumps(plain, allow_nan=False), flush=True)
     return 0

@@ -38,6 +38,7 @@ from makebreak.scripts.outputs import OutputFolder
 from makebreak.scripts.recording_stream import RecordingStream
 from makebreak.scripts.run_buttons import RunButtons
 from makebreak.scripts.run_timing import RunTiming, leaf_systems
+from makebreak.scripts.shown import is_quiet
 from makebreak.scripts.table import json_value
 from makebreak.scripts.trials import run_many
 from makebreak.systems.faults.safety_monitor import verdict
@@ -280,7 +281,7 @@ class Session:
             mininterval=0.2 if tty else 10.0,
             dynamic_ncols=tty,
             ncols=None if tty else 80,
-            disable=not self._progress,
+            disable=is_quiet() or not self._progress,
             leave=len(self._timing) < 5,  # Many simulations: one line, drawn over.
             file=sys.stderr,
         )

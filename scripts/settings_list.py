@@ -63,21 +63,26 @@ def _text(value) -> str:
     return f"[{','.join(map(str, plain))}]" if isinstance(plain, list) else str(plain)
 
 
+def matching_rows(experiment: str, config, text: str) -> list[tuple[str, str, str]]:
+    """(dotted key, default, comment) of the settings whose key or comment has `text` in
+    it. Raises: ValueError if there is none."""
+    rows, low = settings_rows(config), text.lower()
+    rows = [r for r in rows if low in r[0].lower() or low in r[2].lower()]
+    if not rows:
+        raise ValueError(f'list {experiment}: no setting has "{text}" in its name')
+    return rows
+
+
 def settings_text(
     experiment: str, config, text: str = "", width: int | None = None
 ) -> str:
-    """The settings whose key or comment has `text` in it, as key=default and meaning.
+    """matching_rows as key=default and meaning.
 
     Args: width: of the terminal [characters], to which meanings are wrapped; None: one
         line for each setting, as for grep.
     Raises: ValueError if there is none.
     """
-    rows = settings_rows(config)
-    if text:
-        low = text.lower()
-        rows = [r for r in rows if low in r[0].lower() or low in r[2].lower()]
-        if not rows:
-            raise ValueError(f'list {experiment}: no setting has "{text}" in its name')
+    rows = matching_rows(experiment, config, text)
     lines = [f"{experiment}: settings for --set, with their defaults", ""]
     for key, default, meaning in rows:
         head = f"{key}={default}".ljust(MEANING_FROM - 2)

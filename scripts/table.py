@@ -142,8 +142,10 @@ def format_cell(value) -> str:
 
 
 def json_value(value):
-    """A scalar or nested list for JSON: numpy types become Python's, NaN and infinity
-    become None."""
+    """A scalar, or nested lists and mappings of them, for JSON: numpy types become
+    Python's, NaN and infinity become None."""
+    if isinstance(value, dict):
+        return {key: json_value(one) for key, one in value.items()}
     if isinstance(value, list | tuple | np.ndarray):
         return [json_value(one) for one in value]
     if isinstance(value, np.generic):

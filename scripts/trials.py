@@ -26,6 +26,7 @@ from makebreak.scripts.experiments import load_experiment
 from makebreak.scripts.interrupts import interrupts
 from makebreak.scripts.parent import PARENT
 from makebreak.scripts.settings import apply_settings, dump_config
+from makebreak.scripts.shown import is_quiet
 
 _COMMAND = (sys.executable, "-m", "makebreak")
 _LATE = "late"  # Instead of an exit status: the time limit was exceeded.
@@ -185,7 +186,13 @@ def run_commands(
     try:
         with (
             interrupts(),
-            tqdm(total=len(commands), desc=label, unit="run", file=sys.stderr) as bar,
+            tqdm(
+                total=len(commands),
+                desc=label,
+                unit="run",
+                file=sys.stderr,
+                disable=is_quiet(),
+            ) as bar,
             _workers(cluster, jobs) as parallel,
         ):
             waiting = []

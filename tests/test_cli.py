@@ -47,6 +47,36 @@ def read(name, out="out"):
     return json.loads((Path(out) / name).read_text())
 
 
+def test_json_is_one_document_and_the_rest_goes_to_stderr(capsys):
+    assert run("--duration", "10", "--json") == 0
+    told = capsys.readouterr()
+    document = json.loads(told.out)
+    assert (document["command"], document["status"]) == ("run", 0)
+    assert document["result"] == read("result.json")
+    assert {Path(file).name for file in document["files"]} >= {"recording.csv"}
+    rows = {row["result"]: row["value"] for row in document["tables"][0]["rows"]}
+    assert rows["position_end_m"] == document["result"]["position_end_m"]
+    assert "position_end_m" in told.err
+    assert cli.main(["list", "spring_mass", "mass", "--json"]) == 0
+    keys = [each["key"] for each in json.loads(capsys.readouterr().out)["settings"]]
+    assert keys == ["flown"]  # Whose meaning has the word.
+
+
+def test_quiet_tells_errors_only(capsys):
+    assert run("--duration", "10", "--quiet") == 0
+    assert capsys.readouterr() == ("", "")
+    assert run("--set", "mess=1", "--quiet") == 2
+    told = capsys.readouterr()
+    assert told.out == "" and told.err.startswith("makebreak: ")
+
+
+def test_every_command_has_json_and_quiet():
+    words = {action.dest: action for action in make_parser(cli._COMMANDS)._actions}
+    for name, command in words["==SUPPRESS=="].choices.items():
+        has = {"--json", "--quiet"} <= set(command._option_string_actions)
+        assert has == (name != "completion"), name
+
+
 def test_a_run_writes_its_files_and_a_table(capsys):
     assert run("--seed", "3", "--duration", "10") == 0
     written = {path.name for path in Path("out").iterdir()} - {"running"}
@@ -158,7 +188,7 @@ BAD = [
         "--seed is of gap, faults, close_the_loop; did you mean --seeds?",
     ),
     (["gap", "a.yaml", "b.csv", "--job", "1"], "option --job; did you mean --jobs?"),
-    (["bench", "--jobs", "1"], "unknown option --jobs; expected one of: --help"),
+    (["bench", "--jobs", "1"], "unknown option --jobs; did you mean --json?"),
     (["list", "scenes"], "unknown experiment scenes"),
     (["run", "--set", "noise=1", "spring_mass"], "EXPERIMENT comes before --set"),
     (["reproduce", "spring"], "unknown experiment spring; did you mean spring_mass?"),

@@ -1,7 +1,6 @@
 """What a scene's windows are off by, in the channels' own units."""
 
 import json
-import sys
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from makebreak.gap.data.table import write_recording
 from makebreak.gap.simulation.judge import judge
 from makebreak.models.scene import load_scene
 from makebreak.models.scene_file import write_scene
-from makebreak.scripts import judge as command
+from makebreak.scripts import cli
 
 PUSH = 1.2  # [rad/s2] of the measured joint, that the scene lacks.
 WINDOW = 0.5
@@ -75,18 +74,17 @@ def _inertia(scene) -> float:
     return plant.CalcMassMatrix(plant.CreateDefaultContext())[0, 0]
 
 
-def test_the_command_prints_a_column_for_each_scene(case, monkeypatch, capsys):
+def test_the_command_tells_a_column_for_each_scene(case, capsys):
     _, scene, recording = case
-    out = scene.parent / "judged.json"
     words = ["judge", str(scene), str(scene), "--on", str(recording)]
-    monkeypatch.setattr(sys, "argv", [*words, "--window", "0.5", "--json", str(out)])
-    assert command.main() == 0
-    shown = capsys.readouterr().out
-    rows = [line for line in shown.splitlines() if line.startswith("p.j1.position")]
-    for row, written in zip(rows, json.loads(out.read_text()), strict=True):
+    assert cli.main([*words, "--window", "0.5", "--json"]) == 0
+    told = capsys.readouterr()
+    [table] = json.loads(told.out)["tables"]
+    rows = [line for line in told.err.splitlines() if line.startswith("p.j1.position")]
+    for row, written in zip(rows, table["rows"], strict=True):
         assert row.split().count(f"{written[str(scene)]:.4g}") == 2
     assert "0.5 s ahead" in rows[0] and " all " in rows[1]
-    assert "20 windows of 0.5 s of 1 recording;" in shown
+    assert "20 windows of 0.5 s of 1 recording;" in table["notes"][0]
 
 
 @pytest.mark.parametrize(
@@ -94,13 +92,15 @@ def test_the_command_prints_a_column_for_each_scene(case, monkeypatch, capsys):
     [
         (["no.yaml", "--on", "run.csv"], "no.yaml"),
         (["scene.yaml", "--on", "none.csv"], "none.csv"),
-        (["scene.yaml", "--on", "run.csv", "--window", "-1"], "-1.0 s, expected > 0"),
+        (
+            ["scene.yaml", "--on", "run.csv", "--window", "-1"],
+            '"-1", expected a number',
+        ),
         (["scene.yaml", "--on", "run.csv", "--window", "99"], "no episode"),
     ],
 )
 def test_bad_input_is_one_line_and_status_2(case, words, says, monkeypatch, capsys):
     monkeypatch.chdir(case[1].parent)
-    monkeypatch.setattr(sys, "argv", ["judge", *words])
-    assert command.main() == 2
+    assert cli.main(["judge", *words]) == 2
     shown = capsys.readouterr().err
     assert says in shown and shown.count("\n") == 1, shown
