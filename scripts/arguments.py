@@ -303,7 +303,6 @@ def make_parser(functions: Mapping[str, Callable]) -> argparse.ArgumentParser:
         "pattern or a folder names several",
     )
     p.add_argument("--sidecar", metavar="FILE", help=sidecar_help)
-    p.add_argument("--json", action="store_true", help="print all of it as JSON")
     p.add_argument(
         "--robot",
         metavar="FILE",

@@ -240,8 +240,6 @@ def _judge(args) -> int:
 
 
 def _inspect(args) -> int:
-    import json
-
     from makebreak.scripts.inspect_command import run_inspect, run_repair
 
     robot = Path(args.robot) if args.robot else None
@@ -253,9 +251,7 @@ def _inspect(args) -> int:
         return 0
     given = Path(args.sidecar) if args.sidecar else None
     found, files = run_inspect(args.log, robot, out, given)
-    if args.json:
-        print(json.dumps(found.to_dict(), indent=2))
-        return 0
+    tell(**found.to_dict())
     for table in found.tables():
         print(table.to_text())
     if out is None:

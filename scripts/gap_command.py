@@ -185,6 +185,18 @@ def run_and_report(
         return result, files, notes, budget.is_interrupted
 
 
+def sidecar_near(scene_path: Path, recording: Path) -> Path | None:
+    """A sidecar of the recording's name in the scene's folder, where a proposal is
+    written."""
+    near = scene_path.parent / sidecar_of(recording).name
+    if near.is_file() and not near.samefile(scene_path):
+        with suppress(ValueError):
+            content = read_yaml(near)
+            if isinstance(content, dict) and "columns" in content:
+                return near
+    return None
+
+
 def known_sidecars(
     scene_path: Path, recording_paths: Sequence[Path], out: OutputFolder, given
 ) -> tuple[dict[Path, Path], list[str]]:
@@ -198,16 +210,13 @@ def known_sidecars(
 
     found, notes = dict[Path, Path](), list[str]()
     for path in recording_paths:
-        near = scene_path.parent / sidecar_of(path).name
         if given is None and has_sidecar(path):
             continue
-        if given is None and near.is_file() and not near.samefile(scene_path):
-            with suppress(ValueError):
-                content = read_yaml(near)
-                if isinstance(content, dict) and "columns" in content:
-                    found[path] = near
-                    notes.append(f"{path.name}: columns as in {near}")
-                    continue
+        near = None if given is not None else sidecar_near(scene_path, path)
+        if near is not None:
+            found[path] = near
+            notes.append(f"{path.name}: columns as in {near}")
+            continue
         folders = (path.parent, scene_path.parent)
         if given is None and not any(map(has_sidecars, folders)):
             continue

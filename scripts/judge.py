@@ -9,9 +9,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from makebreak.gap.data.reading import read_recordings
+from makebreak.gap.data.sidecar import has_sidecar
 from makebreak.gap.simulation.judge import judge
 from makebreak.models.scene import read_scene
-from makebreak.scripts.gap_command import sidecars_beside
+from makebreak.scripts.gap_command import sidecar_near
 from makebreak.scripts.table import Table
 
 
@@ -23,7 +24,10 @@ def judge_scenes(
 
     Raises: ValueError for scenes and recordings that cannot be used.
     """
-    sidecars = sidecars_beside(Path(scenes[0]), recordings)
+    found = {
+        p: sidecar_near(Path(scenes[0]), p) for p in recordings if not has_sidecar(p)
+    }
+    sidecars = {p: near for p, near in found.items() if near is not None}
     tables = read_recordings(recordings, sidecars=sidecars)
     judged = [judge(read_scene(path), tables, window_sec) for path in scenes]
     first = judged[0]
