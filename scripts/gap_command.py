@@ -1,6 +1,7 @@
 """`makebreak gap`: runs the workflow with a progress bar and writes the report."""
 
 import json
+import os
 import sys
 import traceback
 from collections.abc import Callable, Sequence
@@ -180,6 +181,8 @@ def run_and_report(
             raise
         times = {"wall_s": perf_counter() - start, "stages_s": dict(result.seconds)}
         out.file("timing.json").write_text(json.dumps(times, indent=2) + "\n")
+        if is_robot and not budget.is_interrupted:  # Else it may go to a subfolder.
+            name_from(out_dir, given, scene_path)
         with undisturbed():
             files = out.commit(complete=not budget.is_interrupted)
         return result, files, notes, budget.is_interrupted
@@ -271,6 +274,16 @@ def _proposed(
     notes += [finding.says for finding in doubts if finding.kind == NO_COLUMN]
     notes += [each.says for each in proposal.said]
     return scene, sidecars, notes, doubts
+
+
+def name_from(folder: Path, robot: Path, proposed_scene: Path) -> None:
+    """In a proposed scene that will lie in `folder`, names the robot's file from there,
+    so that both can be moved together."""
+    there = os.path.relpath(robot.resolve(), folder.resolve())
+    text = proposed_scene.read_text()
+    proposed_scene.write_text(
+        text.replace(json.dumps(f"file://{robot.resolve()}"), json.dumps(there))
+    )
 
 
 def exported(scene: Scene, formats: Sequence[str]) -> dict[str, str]:

@@ -6,6 +6,7 @@ from dataclasses import astuple, replace
 import numpy as np
 import pytest
 from gap_benchmark.cases import cases, make
+from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.gap.data.findings import NO_COLUMN
 from makebreak.gap.data.proposal import JointName, of_one_drive, propose
@@ -14,8 +15,9 @@ from makebreak.gap.data.robot import propose_scene, read_log, read_robot
 from makebreak.gap.data.servo_gains import ServoGains, _fitted, _fitted_at
 from makebreak.gap.simulation.scene_simulation import SceneSimulation
 from makebreak.models.dynamics import SceneDynamics
-from makebreak.models.scene import read_scene
+from makebreak.models.scene import load_scene, read_scene
 from makebreak.scripts.cli import main
+from makebreak.scripts.gap_command import name_from
 
 T = np.arange(400) * 0.01
 PANDA = [JointName(f"panda.panda_joint{k}", lower=-2.9, upper=2.9) for k in range(1, 8)]
@@ -403,6 +405,20 @@ def test_inspect_prints_and_writes_only_where_asked(robot_and_log, tmp_path, cap
     assert "columns:" in (tmp_path / "o" / "log.yaml").read_text()
 
 
+def test_a_proposed_scene_can_be_moved_together_with_its_robot(robot_and_log, tmp_path):
+    _, robot, log, _, _ = robot_and_log
+    rig = tmp_path / "rig"
+    (rig / "first").mkdir(parents=True)
+    (rig / robot.name).write_bytes(robot.read_bytes())
+    scene = rig / "first" / "proposed_scene.yaml"
+    proposal = propose_scene(read_robot(rig / robot.name), [read_log(log)])
+    scene.write_text(proposal.scene)
+    name_from(scene.parent, rig / robot.name, scene)
+    rig.rename(tmp_path / "elsewhere")
+    moved = tmp_path / "elsewhere" / "first" / "proposed_scene.yaml"
+    assert load_scene(read_scene(moved), DiagramBuilder()).plant.num_actuators() == 2
+
+
 @pytest.mark.slow
 def test_gap_runs_on_a_robot_and_a_strangers_log(robot_and_log, tmp_path):
     folder, robot, log, _, _ = robot_and_log
@@ -417,6 +433,7 @@ def test_gap_runs_on_a_robot_and_a_strangers_log(robot_and_log, tmp_path):
     page = (out / "report.html").read_text()
     assert f"makebreak gap {robot} {log} --out {out}" in page
     assert ".unfinished" not in page
+    assert str(tmp_path) not in (out / "proposed_scene.yaml").read_text()
     again = ["gap", str(out / "proposed_scene.yaml"), str(log), "--jobs", "1"]
     assert main([*again, "--out", str(tmp_path / "again")]) == 0
 
