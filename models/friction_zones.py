@@ -28,6 +28,8 @@ from pydrake.multibody.plant import (
 from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import LeafSystem
 
+import makebreak.systems.numerics.code_cache  # noqa: F401  (before its functions)
+
 # The force is explicit in time: 0.5 times 12 N over 5 mm/s is 1200 N s/m, which takes
 # 30 % of the speed of 4 kg in a step of 1 ms.
 FADE_SPEED = 0.005  # [m/s]

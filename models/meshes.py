@@ -9,16 +9,15 @@ from typing import Any
 
 import numpy as np
 
+from makebreak.systems.numerics.code_cache import user_cache
+
 READ_BY_DRAKE = (".obj", ".vtk", ".gltf")
 
 
 def cache_folder() -> Path:
-    """Where converted files stay: $XDG_CACHE_HOME/makebreak, or ~/.cache/makebreak; a
-    folder of temporary files where none can be written there."""
-    home = os.environ.get("XDG_CACHE_HOME") or os.path.join(
-        os.path.expanduser("~"), ".cache"
-    )
-    folder = Path(home) / "makebreak"
+    """Where converted files stay: the user's cache; a folder of temporary files where
+    none can be written there."""
+    folder = user_cache()
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if os.access(folder, os.W_OK):

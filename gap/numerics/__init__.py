@@ -1,0 +1,1 @@
+import makebreak.systems.numerics.code_cache  # noqa: F401  (before its functions)

@@ -3,6 +3,7 @@
 Each family of kinds has a file; a new kind is one entry of its family's KINDS.
 """
 
+import makebreak.systems.numerics.code_cache  # noqa: F401  (before its functions)
 from makebreak.models.effects import (
     actuation,
     contact,
