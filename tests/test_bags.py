@@ -1,10 +1,13 @@
 """Bags and datasets that the tests write themselves, read as recordings."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from makebreak.gap.data.bags import motor_ranges
+from makebreak.gap.data.proposal import JointName, propose
 from makebreak.gap.data.reading import read_recording
 from makebreak.gap.data.table import read_table
 
@@ -236,3 +239,48 @@ def test_topics_of_two_clocks_are_brought_to_one_and_it_is_said(
         # The median of the offsets is exact here, to nanoseconds of rounding.
         expected = position(time[there], 0)
         np.testing.assert_allclose(table.columns[name][there], expected, atol=1e-6)
+
+
+def calibration(half, reversed):
+    """As LeRobot writes it, of a motor that turns `half` rad to each side of 2048."""
+    ticks = round(half * 4095 / (2.0 * np.pi))
+    return {"id": 1, "drive_mode": int(reversed), "homing_offset": 7,
+            "range_min": 2048 - ticks, "range_max": 2048 + ticks}  # fmt: skip
+
+
+def test_positions_in_per_cent_of_a_range_are_read_by_the_arms_calibration(tmp_path):
+    names = ["pan.pos", "lift.pos"]
+    write_dataset(tmp_path / "set", names)
+    joints = [JointName("so.pan", False, -1.9, 1.9), JointName("so.lift", False, -1, 2)]
+    halves = {"pan": calibration(1.7, False), "lift": calibration(1.4, True)}
+    file = tmp_path / "set" / "my_arm.json"
+    file.write_text(json.dumps(halves))
+    q = np.linspace(-98.0, 95.0, 50)
+    columns = {f"observation.state.{name}": q for name in names}
+    ranges = motor_ranges(tmp_path / "set", {})
+    pan, lift = propose(columns, joints, ranges=ranges)
+    # A tick is 1.5 mrad; the middle of a range is that of the limits.
+    assert pan.channel == "so.pan.position" and "its calibration" in pan.why
+    assert 100.0 * pan.scale == pytest.approx(1.7, abs=2e-3) and pan.offset == 0.0
+    assert 100.0 * lift.scale == pytest.approx(-1.4, abs=2e-3) and lift.offset == 0.5
+    # Beyond 100 they are degrees, whatever the file says.
+    degrees = {name: 1.2 * y for name, y in columns.items()}
+    assert all(
+        m.scale == np.pi / 180.0 for m in propose(degrees, joints, ranges=ranges)
+    )
+    file.write_text("[]")
+    assert motor_ranges(tmp_path / "set", {}) == {}
+    with pytest.raises(ValueError, match="my_arm.json: expected {motor: {range_min"):
+        motor_ranges(tmp_path / "set", {"calibration": file})
+
+
+def test_without_a_calibration_the_limits_tell_what_degrees_cannot_be():
+    q = np.linspace(-98.0, 95.0, 50)
+    columns = {"pan.pos": q, "lift.pos": 0.9 * q, "gripper.pos": np.abs(q)}
+    small = [JointName("so.pan", False, -1.0, 1.0), JointName("so.lift", False, -2, 2),
+             JointName("so.gripper", False, -0.2, 1.8)]  # fmt: skip
+    pan, lift, gripper = propose(columns, small)
+    assert (100.0 * pan.scale, 100.0 * lift.scale) == pytest.approx((1.0, 2.0))
+    assert (100.0 * gripper.scale, gripper.offset) == pytest.approx((2.0, -0.2))
+    wide = [replace(joint, lower=-1.8, upper=1.8) for joint in small]
+    assert all(m.scale == np.pi / 180.0 for m in propose(columns, wide))

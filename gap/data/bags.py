@@ -8,13 +8,15 @@ of its features, <feature>.<name>.
 """
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 
 BAGS = (".bag", ".mcap", ".db3")
+TICKS = 4096  # A turn of a LeRobot arm's motor.
 LONGEST_ARRAY = 64  # Longer ones are pictures, maps, clouds.
 _JOINT_STATE = "sensor_msgs/msg/JointState"
 _TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
@@ -259,3 +261,40 @@ def _labels(feature) -> list[str]:
     if isinstance(names, list) and all(isinstance(name, str) for name in names):
         return names
     return []
+
+
+@dataclass(frozen=True)
+class MotorRange:
+    """Of a motor by LeRobot's calibration: half of what it turns [rad], and whether it
+    counts the other way."""
+
+    half: float
+    reversed: bool
+
+
+def motor_ranges(path: Path, sidecar: Mapping) -> dict[str, MotorRange]:
+    """{motor: its range} by the file that a sidecar names (`calibration`), or by one in
+    a dataset's folder; none: {}.
+
+    Raises: ValueError for a file that is named and is no calibration.
+    """
+    named = sidecar.get("calibration")
+    inside = sorted(path.glob("*.json")) + sorted(path.glob("meta/*.json"))
+    for file in [named] if named else inside if is_dataset(path) else []:
+        try:
+            found = {
+                str(motor): MotorRange(
+                    np.pi * (own["range_max"] - own["range_min"]) / (TICKS - 1),
+                    bool(own.get("drive_mode")),
+                )
+                for motor, own in json.loads(file.read_text()).items()
+            }
+            if found:
+                return found
+        except (ValueError, KeyError, TypeError, AttributeError, OSError) as error:
+            if named:
+                raise ValueError(
+                    f"calibration {file}: expected {{motor: {{range_min, range_max}}}} "
+                    f"as LeRobot writes it, got {type(error).__name__}: {error}"
+                ) from None
+    return {}

@@ -12,11 +12,16 @@ import numpy as np
 import yaml
 
 from makebreak.gap.data.arrays import TIME_WORDS, words_of
+from makebreak.gap.data.bags import MotorRange
 from makebreak.gap.data.csv_table import is_nameless
 from makebreak.gap.data.table import COMMANDS, is_channel
 
 DEG = np.pi / 180.0
 UNKNOWN_JOINT = "of an unknown joint"  # Why such a column is left out.
+IN_DEGREES = "in degrees, by its name or its size"
+FULL_RANGE = 100.5  # Per cent, from one end of a joint's range, or from its middle.
+# Times its limit that a joint would be at, were it in degrees.
+_BEYOND = 1.25
 AS_SAID = "as the recording's sidecar says"
 _COMMAND = set(
     "cmd command commands commanded target desired des ref reference goal goals "
@@ -107,12 +112,13 @@ def propose(
     joints: Sequence[JointName],
     text: Mapping[str, str] | None = None,
     said: Mapping[str, Match] | None = None,
+    ranges: Mapping[str, MotorRange] | None = None,
 ) -> list[Match]:
     """One for each column, in their order.
 
     Args: columns {name: (n,)}, NaN where nothing is; joints in the robot's order; text:
         {column that holds no numbers: what is in all its cells, or ""}; said: what the
-        log's own sidecar says of columns, which stays.
+        log's own sidecar says of columns, which stays; ranges: {motor: its range}.
     """
     text, said = text or {}, said or {}
     found = {name: Match(name, None, why="text") for name in text}
@@ -162,7 +168,7 @@ def propose(
         else:
             found[name] = Match(name, f"{joint.name}.{quantity}", why="by its name")
     found = _once(_without_unknown_efforts(found, joints), said)
-    found = _in_si(_by_motion(found, columns), columns, joints)
+    found = _in_si(_by_motion(found, columns), columns, joints, ranges or {})
     found |= {name: match for name, match in said.items() if name in found}
     return [found[name] for name in [*columns, *text]]
 
@@ -524,7 +530,9 @@ def _without_unknown_efforts(
     return out
 
 
-def _in_si(found, columns, joints: Sequence[JointName]) -> dict[str, Match]:
+def _in_si(
+    found, columns, joints: Sequence[JointName], ranges: Mapping[str, MotorRange]
+) -> dict[str, Match]:
     """Scales of positions, of what goes with them, and where names say a unit."""
     of = {joint.name: joint for joint in joints}
     told = {}
@@ -532,6 +540,7 @@ def _in_si(found, columns, joints: Sequence[JointName]) -> dict[str, Match]:
         if scale is not None:
             why = f"{match.why}; in {unit}, by its name"
             told[match.column] = replace(match, scale=scale, why=why)
+    told |= _of_ranges(found, told, columns, of, ranges)
     rest = {name: match for name, match in found.items() if name not in told}
     out = {**found, **_in_si_by_size(rest, told, columns, of)}
     for name, match in told.items():
@@ -563,6 +572,41 @@ def _against_position(match: Match, found, columns) -> Match:
     return match
 
 
+def _of_ranges(found, told, columns, of, ranges) -> dict[str, Match]:
+    """Positions in per cent of joints' ranges (LeRobot: -100 to 100, a gripper's 0 to
+    100): by the arm's calibration, or where they would be far beyond the limits in
+    degrees. The middle of a range is that of the limits."""
+    mine = {
+        name: of[m.channel.rpartition(".")[0]] for name, m in found.items()
+        if m.channel and m.channel.endswith((".position", ".position_command"))
+        and name not in told and m.channel != name and np.isfinite(columns[name]).any()
+        and m.channel.rpartition(".")[0] in of
+    }  # fmt: skip
+    mine = {n: j for n, j in mine.items()
+            if np.isfinite(j.upper - j.lower) and not j.prismatic}  # fmt: skip
+    size = {name: float(np.nanmax(np.abs(columns[name]))) for name in mine}
+    if not size or not 2.0 * np.pi < max(size.values()) <= FULL_RANGE:
+        return {}
+    far = [n for n, j in mine.items()
+           if DEG * size[n] > _BEYOND * max(abs(j.lower), abs(j.upper))]  # fmt: skip
+    plain = {_plain(motor): own for motor, own in ranges.items()}
+    out = {}
+    for name, joint in mine.items():
+        own = next((own for motor, own in plain.items() if motor in _plain(name)), None)
+        if own is None and not far:
+            continue
+        half = own.half if own is not None else 0.5 * (joint.upper - joint.lower)
+        sign = -1.0 if own is not None and own.reversed else 1.0
+        from_end = "gripper" in words_of(name) and np.nanmin(columns[name]) > -0.5
+        middle = 0.5 * (joint.lower + joint.upper)
+        scale = sign * half * (2.0 if from_end else 1.0) / 100.0
+        offset = (joint.lower if sign > 0.0 else joint.upper) if from_end else middle
+        by = "its calibration" if own is not None else "its limits"
+        why = f"{found[name].why}; per cent of its range, by {by}"
+        out[name] = replace(found[name], scale=scale, offset=offset, why=why)
+    return out
+
+
 def _in_si_by_size(found, told, columns, of) -> dict[str, Match]:
     """Of columns `found`, whose names say no unit. told: the others."""
     out = {**found, **told}
@@ -589,8 +633,8 @@ def _in_si_by_size(found, told, columns, of) -> dict[str, Match]:
         at, _, what = match.channel.rpartition(".")
         turns = at in of and not of[at].prismatic
         if turns and "position" in what and degrees.get(_template(name)):
-            why = "in degrees, by its name or its size"
-            out[name] = Match(name, match.channel, DEG, why=f"{match.why}; {why}")
+            why = f"{match.why}; {IN_DEGREES}"
+            out[name] = Match(name, match.channel, DEG, why=why)
         elif what in ("position", "position_command") and at in millimetres:
             why = "in mm, by its size"
             out[name] = Match(name, match.channel, 1e-3, why=f"{match.why}; {why}")

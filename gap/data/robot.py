@@ -8,10 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 
+from makebreak.gap.data.bags import MotorRange, is_dataset, motor_ranges
+from makebreak.gap.data.base_pose import BasePose, base_pose
 from makebreak.gap.data.content import Contents, Said, by_content, told_by
 from makebreak.gap.data.findings import (
     FIXED,
@@ -25,6 +28,8 @@ from makebreak.gap.data.joined import read_joined
 from makebreak.gap.data.proposal import (
     AS_SAID,
     CURRENT,
+    FULL_RANGE,
+    IN_DEGREES,
     UNKNOWN_JOINT,
     JointName,
     Match,
@@ -69,7 +74,8 @@ LEAST_LOAD = 0.05  # Of a joint's rms gravity torque [N m], to tell its servo by
 @dataclass(frozen=True, eq=False)
 class Robot:
     """joints: in the order of the robot's coordinates. bases: bodies that nothing
-    holds. plant: finalized, with the bases welded to the world."""
+    holds. plant: finalized, with the bases welded to the world, where a log says, pose,
+    or upright."""
 
     path: Path
     model: str
@@ -78,6 +84,7 @@ class Robot:
     effort_limits: dict[str, float]
     plant: MultibodyPlant
     file: RobotFile
+    pose: BasePose | None = None
 
 
 def read_robot(path: Path) -> Robot:
@@ -106,9 +113,13 @@ def read_robot(path: Path) -> Robot:
 
 
 def _load(
-    path: Path, welded: Sequence[str] = (), fixed: Mapping[str, float] | None = None
+    path: Path,
+    welded: Sequence[str] = (),
+    fixed: Mapping[str, float] | None = None,
+    pose: BasePose | None = None,
 ) -> MultibodyPlant:
-    """fixed: {joint, without the model's name: where it stands}."""
+    """fixed: {joint, without the model's name: where it stands}; pose: of what is
+    welded."""
     plant = MultibodyPlant(0.0)
     file = without_lost_collisions(path, given_packages())
     try:
@@ -119,7 +130,8 @@ def _load(
         if len(models) != 1:
             raise ValueError(f"it holds {len(models)} models, expected one")
         for base in welded:
-            plant.WeldFrames(plant.world_frame(), plant.GetFrameByName(base))
+            frame = plant.GetFrameByName(base)
+            plant.WeldFrames(plant.world_frame(), frame, _transform(pose))
         model = plant.GetModelInstanceName(models[0])
         there = {f"{model}.{name}": q for name, q in (fixed or {}).items()}
         fix_joints(plant, there, len(couplings_in(file.text)))
@@ -132,6 +144,12 @@ def _load(
         why = " ".join(str(error).split())
         raise ValueError(f"robot {path} cannot be read: {why[:1000]}") from None
     return plant
+
+
+def _transform(pose: BasePose | None) -> RigidTransform:
+    if pose is None:
+        return RigidTransform()
+    return RigidTransform(RotationMatrix(pose.rotation.as_matrix()), pose.position)
 
 
 def _instance(plant: MultibodyPlant):
@@ -196,7 +214,7 @@ def _with_fixed(robot: Robot, fixed: Mapping[str, float]) -> Robot:
     return replace(
         robot,
         joints=tuple(j for j in robot.joints if j.name not in fixed),
-        plant=_load(robot.path, robot.bases, names),
+        plant=_load(robot.path, robot.bases, names, robot.pose),
     )
 
 
@@ -206,13 +224,15 @@ def _with_fixed(robot: Robot, fixed: Mapping[str, float]) -> Robot:
 @dataclass(frozen=True, eq=False)
 class Log:
     """A log as it is: the table of its numbers, columns of text with what is in all
-    their cells, what its sidecar says, and which that is."""
+    their cells, what its sidecar says, and which that is; ranges of its motors by
+    their calibration."""
 
     path: Path
     table: RecordingTable
     text: Mapping[str, str] = field(default_factory=dict)
     own: Mapping[str, Any] = field(default_factory=dict)
     sidecar: Found = Found({})
+    ranges: Mapping[str, MotorRange] = field(default_factory=dict)
 
 
 def read_log(
@@ -227,16 +247,18 @@ def read_log(
     table, text = read_joined(path, own, with_text=True)
     unused = [k for k, to in (own.get("columns") or {}).items() if to is None]
     found = sidecar_for(path, [*table.columns, *text, *unused], sidecar, folders)
-    return Log(path, table, text, found.sections, found)
+    return Log(
+        path, table, text, found.sections, found, motor_ranges(path, own)
+    )  # fmt: skip
 
 
 def matches_of(log: Log, robot: Robot | None) -> list[Match]:
     joints = robot.joints if robot is not None else ()
-    return propose(
-        log.table.columns, joints, log.text, said_of(log.own.get("columns") or {})
-    )
+    said = said_of(log.own.get("columns") or {})
+    return propose(log.table.columns, joints, log.text, said, log.ranges)
 
 
+BASE_MOVES = "base_moves"
 NO_ACTUATION = ["actuation: {type: none}"]
 FROM_SAG = "from how far joints sag below their commands"
 FROM_MOTION = "from how joints followed their commands"
@@ -270,7 +292,15 @@ class Proposal:
         """What a result must not forget."""
         name = self.first
         found = [
-            Finding(each.kind, name, each.channel, each.size, "", "warning", each.says)
+            Finding(
+                each.kind,
+                name,
+                each.channel,
+                each.size,
+                "",
+                "error" if each.kind == BASE_MOVES else "warning",
+                each.says,
+            )
             for each in self.said
         ]
         if self.gains_of:
@@ -325,10 +355,26 @@ class Judged:
 def judge_logs(robot: Robot, logs: Sequence[Log]) -> Judged:
     """Raises: ValueError for coupled joints that carry others."""
     every = {log.path: matches_of(log, robot) for log in logs}
+    pose = (
+        base_pose([_unsaid(log) for log in logs], robot.bases) if robot.bases else None
+    )
+    if pose is not None:
+        plant = _load(robot.path, robot.bases, pose=pose)
+        robot = replace(robot, plant=plant, pose=pose)
+        every = {path: _without_pose(pose, own) for path, own in every.items()}
     unused = dict.fromkeys(m.column for matches in every.values() for m in matches
                            if m.why.endswith(UNKNOWN_JOINT))  # fmt: skip
     every = {path: _through_gears(robot, own) for path, own in every.items()}
     said: list[Said] = []
+    if pose is not None and not pose.is_still:
+        says = (
+            f"{robot.bases[0]}, the base, moves by {_moves(pose)} in the log, and the "
+            "proposed scene holds it where it was on average: what its motion does to "
+            "the joints is not in the model. Use logs of it on a stand, or a scene in "
+            "which it is free, with what it stands on."
+        )
+        said.append(Said(BASE_MOVES, robot.bases[0], pose.turned, says))
+    said += _maybe_of_a_range(logs, every)
     fixed = _standing(robot, every, logs, bool(unused))
     if fixed:
         robot = _with_fixed(robot, fixed)
@@ -340,6 +386,38 @@ def judge_logs(robot: Robot, logs: Sequence[Log]) -> Judged:
         every[log.path] = of_one_drive(matches)
         said += [each for each in more if each not in said]
     return Judged(robot, every, fixed, tuple(unused), tuple(said))
+
+
+def _maybe_of_a_range(logs: Sequence[Log], every) -> list[Said]:
+    """Of LeRobot's positions in degrees, which may be per cent of a range."""
+    said = []
+    for log in logs:
+        mine = [m for m in every[log.path] if m.why.endswith(IN_DEGREES)]
+        most = [np.nanmax(np.abs(log.table.columns[m.column])) for m in mine]
+        if is_dataset(log.path) and mine and not log.ranges and max(most) <= FULL_RANGE:
+            says = (
+                f"{mine[0].column} and others are read as degrees; they may be -100 to "
+                "100 of each joint's range: then put the arm's calibration file "
+                "(.json) into the dataset's folder, or name it in the sidecar: "
+                "calibration: FILE."
+            )
+            said.append(Said("position_unit", str(mine[0].channel), 0.0, says))
+    return said
+
+
+def _unsaid(log: Log) -> dict[str, np.ndarray]:
+    """Columns of which the log's sidecar says nothing."""
+    said = log.own.get("columns") or {}
+    return {k: y for k, y in log.table.columns.items() if k not in said}
+
+
+def _without_pose(pose: BasePose, matches: Sequence[Match]) -> list[Match]:
+    """Without columns of the base's pose, where it is welded."""
+    why = "the base's pose: it is welded there"
+    return [
+        Match(m.column, None, why=why)
+        if m.column in pose.columns and m.why != AS_SAID else m for m in matches
+    ]  # fmt: skip
 
 
 def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
@@ -385,15 +463,9 @@ def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
             f"{left_out} collision meshes of {robot.path.name} are not there and left "
             "out, so it touches nothing (--package NAME=PATH says where they are)"
         )
-    for base in robot.bases:
-        lines.append(
-            f"- add_weld: {{parent: world, child: {robot.model}::{base}}}"
-            "  # It stands upright on the world's origin."
-        )
-        notes.append(
-            f"{base} is welded to the world, upright: a base that moves, or is tilted, "
-            "needs its pose in the log and a scene without this weld"
-        )
+    more, said_of_base = _welds(robot)
+    lines += more
+    notes += said_of_base
     if fixed:
         where = ", ".join(f"{name}: {q:g}" for name, q in fixed.items())
         lines.append(
@@ -431,6 +503,39 @@ def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
         robot.file.notes,
         judged.said,
     )
+
+
+def _welds(robot: Robot) -> tuple[list[str], list[str]]:
+    """Lines that hold the robot's bases, and what is to be said of it."""
+    lines, notes, pose = [], [], robot.pose
+    for base in robot.bases:
+        weld = f"- add_weld: {{parent: world, child: {robot.model}::{base}"
+        if pose is None:
+            lines.append(f"{weld}}}  # It stands level on the world's origin.")
+            notes.append(
+                f"{base} is welded to the world, level, as no column has its pose: if "
+                "it was tilted, hung over or moved, turn it in the scene's add_weld "
+                "(X_PC)"
+            )
+            continue
+        turn = pose.rotation.as_rotvec(degrees=True)
+        angle = float(np.linalg.norm(turn))
+        axis = [float(f"{x:.6g}") for x in turn / max(angle, 1e-12)]
+        if angle < 1e-3:
+            axis = [0.0, 0.0, 1.0]
+        lines.append(
+            f"{weld}, X_PC: {{translation: {list(pose.position)}, rotation: "
+            f"!AngleAxis {{angle_deg: {angle:.5g}, axis: {axis}}}}}}}  # As in the log."
+        )
+        notes.append(
+            f"{base} is welded to the world at the pose that the log has of it, turned "
+            f"by {angle:.3g} deg ({pose.says}); it moves by {_moves(pose)} there"
+        )
+    return lines, notes
+
+
+def _moves(pose: BasePose) -> str:
+    return f"{np.rad2deg(pose.turned):.2g} deg and {1e3 * pose.moved:.3g} mm"
 
 
 def _effects_of_file(robot: Robot, fixed, lines: Sequence[str]) -> list[str]:

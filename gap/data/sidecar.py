@@ -16,6 +16,7 @@ from makebreak.gap.data.table import stem_of
 
 _SECTIONS = (
     "noise", "filters", "columns", "wrench", "ignore", "join", "provenance",
+    "calibration",
 )  # fmt: skip
 _OF_ONE_LOG = ("ignore", "join", "provenance")
 
@@ -42,14 +43,18 @@ def has_sidecars(folder: Path) -> bool:
 
 def own_sections(path: Path) -> dict:
     """{section: as written} of the sidecar beside a recording, with whole paths of
-    joined files; none: {}.
+    files; none: {}.
 
     Raises: ValueError as read_sidecars.
     """
-    join = read_sidecars(path, None).get("join")
+    read = read_sidecars(path, None)
     own = _own_sidecars(path)
     found = (_sections(own[0]) or {}) if own else {}
-    return found | ({"join": [str(file.resolve()) for file in join]} if join else {})
+    if "join" in read:
+        found["join"] = [str(file.resolve()) for file in read["join"]]
+    if "calibration" in read:
+        found["calibration"] = str(read["calibration"].resolve())
+    return found
 
 
 @dataclass(frozen=True)
@@ -172,8 +177,9 @@ def read_sidecars(path: Path, given: Path | None) -> dict:
                 raise ValueError(f'{file}: "{key}", expected one of {expected}')
             if key == "ignore":
                 value = _spans(file, value)
-            elif key == "join":
-                value = _files_of(file, value)
+            elif key in ("join", "calibration"):
+                value = _files_of(file, key, value)
+                value = value if key == "join" else value[0]
             elif key != "provenance" and value is not None:
                 if not isinstance(value, dict):
                     raise ValueError(f"{file}: {key} must be names with values")
@@ -209,11 +215,11 @@ def _sections(file: Path) -> dict | None:
     return data
 
 
-def _files_of(file: Path, said) -> list[Path]:
+def _files_of(file: Path, key: str, said) -> list[Path]:
     """Files, named beside the sidecar, that belong to a recording."""
     names = said if isinstance(said, list) else [said]
     if not names or not all(isinstance(name, str) for name in names):
-        raise ValueError(f"{file}: join: got {said}, expected a file name, or a list")
+        raise ValueError(f"{file}: {key}: got {said}, expected a file name, or a list")
     return [file.parent / name for name in names]
 
 

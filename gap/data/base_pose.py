@@ -1,0 +1,196 @@
+"""Where a robot's base is, by its pose in the log: of an IMU, a tracker, a simulator.
+
+A quaternion is four columns of unit length, whatever their names; else roll, pitch and
+yaw, or gravity's direction in the base, tell how it stands.
+"""
+
+import re
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from makebreak.gap.data.arrays import words_of
+
+# Moves less than this: it is on a stand, hung up, or screwed down.
+_STILL_RAD, _STILL_M = 0.05, 0.02
+_BASE = set(
+    "base root torso trunk pelvis body imu floating odom odometry waist".split()
+)
+_NOT = set(
+    "cmd command commands target desired des ref goal ee tool hand tcp gripper object "
+    "ball box camera cam foot feet tip contact head wrist joint joints dof".split()
+)
+_TURNS = set("quat quaternion orientation rot rotation attitude pose".split())
+_ENTRY = re.compile(
+    r"(.*?)[^a-z0-9]*?(q?[wxyz]|roll|pitch|yaw|\d+)"
+    r"([^a-z0-9]+(deg|degrees|rad|radians|m|mm))?[^a-z0-9]*"
+)
+
+
+@dataclass(frozen=True)
+class BasePose:
+    """orientation: scalar first, of the base in world, on the middle of the log;
+    position [m], zeros where the log has none. turned [rad], moved [m]: the most but
+    for a twentieth of the rows. columns: all that were used. says: how it was read."""
+
+    orientation: tuple[float, ...]
+    position: tuple[float, ...]
+    turned: float
+    moved: float
+    columns: tuple[str, ...]
+    says: str
+
+    @property
+    def is_still(self) -> bool:
+        return self.turned < _STILL_RAD and self.moved < _STILL_M
+
+    @property
+    def rotation(self) -> Rotation:
+        return Rotation.from_quat(self.orientation, scalar_first=True)
+
+
+def base_pose(
+    logs: Sequence[Mapping[str, np.ndarray]], bases: Sequence[str]
+) -> BasePose | None:
+    """None where no log has a base's orientation.
+
+    Args: logs: each {column: (n,)}; bases: names of bodies that nothing holds.
+    """
+    if not bases:
+        return None
+    first = next((c for c in logs if _orientations(c, bases)), None)
+    if first is None:
+        return None
+    names, kind = _orientations(first, bases)[0]
+    place = _position(first, bases)
+    have = [c for c in logs if set(names) <= set(c)]
+    turns, says = _rotations(
+        np.concatenate([np.stack([c[n] for n in names], axis=1) for c in have]), kind
+    )
+    middle = turns.mean()
+    off = (middle.inv() * turns).magnitude()
+    at, moved = np.zeros(3), 0.0
+    if place:
+        p = np.concatenate(
+            [np.stack([c[n] for n in place], axis=1) for c in have if {*place} <= {*c}]
+        )
+        p = p[np.isfinite(p).all(axis=1)]
+        if len(p):
+            at = np.median(p, axis=0)
+            moved = float(np.quantile(np.linalg.norm(p - at, axis=1), 0.95))
+    w = middle.as_quat(scalar_first=True)
+    return BasePose(
+        tuple(float(f"{x:.5g}") for x in w), tuple(float(f"{x:.5g}") for x in at),
+        float(np.quantile(off, 0.95)), moved, (*names, *place),
+        f"{', '.join(names)} {says}",
+    )  # fmt: skip
+
+
+def _orientations(
+    columns: Mapping[str, np.ndarray], bases: Sequence[str]
+) -> list[tuple[tuple[str, ...], str]]:
+    """(columns, kind) of each, those first that have a base's name."""
+    found: list[tuple[int, int, tuple[str, ...], str]] = []
+    for prefix, parts in _groups(columns).items():
+        words = set(words_of(prefix))
+        if words & _NOT:
+            continue
+        rank = _rank(words, bases)
+        said = bool(words & _TURNS)
+        for keys in (("w", "x", "y", "z"), *_counted(4)):
+            own = tuple(parts[k] for k in keys if k in parts)
+            if len(own) == 4 and (said or rank < 2 or keys[0] == "w"):
+                size = np.linalg.norm([columns[n] for n in own], axis=0)
+                size = size[np.isfinite(size)]
+                if len(size) and np.quantile(np.abs(size - 1.0), 0.95) < 0.02:
+                    kind = "quaternion" if keys[0] == "w" else "four"
+                    found.append((rank, 0, own, kind))
+                break
+        if "roll" in parts and "pitch" in parts:
+            own = tuple(parts[k] for k in ("roll", "pitch", "yaw") if k in parts)
+            if not any(re.search("rate|vel|gyro|speed", n.lower()) for n in own):
+                found.append((rank, 1, own, "angles"))
+        if "gravity" in words:
+            for keys in (("x", "y", "z"), *_counted(3)):
+                own = tuple(parts[k] for k in keys if k in parts)
+                if len(own) == 3 and "3" not in parts:
+                    found.append((rank, 2, own, "gravity"))
+                    break
+    found.sort(key=lambda each: each[:2])
+    return [(own, kind) for _, _, own, kind in found]
+
+
+def _position(
+    columns: Mapping[str, np.ndarray], bases: Sequence[str]
+) -> tuple[str, ...]:
+    """The columns of a base's place; () where there are none."""
+    for prefix, parts in _groups(columns).items():
+        words = set(words_of(prefix))
+        if words & (_NOT | _TURNS - {"pose"}) or _rank(words, bases) > 1:
+            continue
+        if not words & {"pos", "position", "xyz", "translation", "pose", *bases} and (
+            not set(parts) >= {"x", "y", "z", "w"}
+        ):
+            continue
+        if words & {"vel", "velocity", "lin", "ang", "acc", "acceleration", "gravity"}:
+            continue
+        for keys in (("x", "y", "z"), *_counted(3)):
+            own = tuple(parts[k] for k in keys if k in parts)
+            if len(own) == 3 and not {"w", "3"} & set(parts):
+                return own
+    return ()
+
+
+def _groups(columns: Collection[str]) -> dict[str, dict[str, str]]:
+    """{what columns' names begin with: {part: column}}, as base_quat: {w: base_quat_w}.
+    A `q` before x, y and z belongs to the name: base_qx is no place."""
+    found: dict[str, dict[str, str]] = {}
+    for name in columns:
+        match = _ENTRY.fullmatch(name.lower())
+        if match is not None:
+            prefix, part = match[1], match[2]
+            if len(part) == 2 and part[0] == "q":
+                prefix, part = f"{prefix} quat", part[1]
+            found.setdefault(prefix, {})[part] = name
+    return found
+
+
+def _counted(n: int) -> list[tuple[str, ...]]:
+    """Names of n entries that are counted, from 0 or from 1."""
+    return [tuple(str(k + first) for k in range(n)) for first in (0, 1)]
+
+
+def _rank(words: set[str], bases: Sequence[str]) -> int:
+    """0 where a base's own name is in it, 1 where it is one for a base, else 2."""
+    own = [set(words_of(base)) for base in bases]
+    return 0 if any(w and w <= words for w in own) else 1 if words & _BASE else 2
+
+
+def _rotations(rows: np.ndarray, kind: str):
+    """Rotations of the rows that are whole, and how they were taken."""
+    y = rows[np.isfinite(rows).all(axis=1)]
+    if kind == "angles":
+        y = y if y.shape[1] == 3 else np.column_stack([y, np.zeros(len(y))])
+        degrees = bool(np.abs(y).max() > 2.0 * np.pi)
+        unit = "degrees" if degrees else "radians"
+        return Rotation.from_euler("xyz", y, degrees), f"are taken in {unit}"
+    if kind == "gravity":  # Down, in the base's axes; which way it looks is unknown.
+        down = y / np.linalg.norm(y, axis=1)[:, None]
+        # The shortest turn that takes what the base has for down to down.
+        axis = np.cross(down, [0.0, 0.0, -1.0])
+        angle = np.arctan2(np.linalg.norm(axis, axis=1), -down[:, 2])
+        size = np.maximum(np.linalg.norm(axis, axis=1), 1e-12)
+        turns = Rotation.from_rotvec(axis / size[:, None] * angle[:, None])
+        return turns, "are gravity's direction in it"
+    if (
+        kind == "four"
+    ):  # Scalar first or last: as it stands more upright, or turns less.
+        tried = [Rotation.from_quat(y, scalar_first=first) for first in (True, False)]
+        up = [round(float(r.mean().as_matrix()[2, 2]), 2) for r in tried]
+        less = [-round(float(r.mean().magnitude()), 2) for r in tried]
+        last = (up[1], less[1]) > (up[0], less[0])
+        shown = "x, y, z, w" if last else "w, x, y, z"
+        return tried[last], f"are taken as {shown}"
+    return Rotation.from_quat(y, scalar_first=True), "are its quaternion"
