@@ -16,6 +16,7 @@ from pydrake.systems.framework import DiagramBuilder
 from scipy.optimize import linprog, minimize
 from scipy.spatial.transform import Rotation
 
+from makebreak import model_path
 from makebreak.scripts.bench_c3 import (
     OsqpC3,
     ball,
@@ -568,6 +569,37 @@ def test_bounds_hold_and_far_ones_change_nothing(projection):
     assert -2.0 <= plan.u.min() and plan.u.max() <= u_max
     step = plan.x[:-1] @ lcs.A.T + plan.u @ lcs.B.T + plan.lam @ lcs.D.T + lcs.d
     np.testing.assert_allclose(plan.x[1:], step, atol=1e-9)  # Still the dynamics.
+
+
+@pytest.mark.parametrize("projection", [PLUS, C3_QP, EXACT])
+def test_a_bound_is_not_met_by_a_contact_that_pulls(projection):
+    """A finger behind a puck can push it, not fetch it back."""
+    plant, _ = AddMultibodyPlantSceneGraph(builder := DiagramBuilder(), 0.0)
+    Parser(plant).AddModels(str(model_path("puck.sdf")))
+    plant.Finalize()
+    model = AnitescuLcs(builder.Build(), [ContactPair("finger", "puck", 0.3)], 0.05)
+    x0 = model.x_default
+    lcs = model.build(x0, np.zeros(model.n_u))
+    n = lcs.n_x + lcs.n_lam * (2 if projection is PLUS else 1) + lcs.n_u
+    weights = C3Weights(
+        np.array([0.0, 200.0, 1.0, 20.0]), np.array([0.01]), np.ones(n), np.ones(n)
+    )
+    x_desired = np.tile([0.4, 0.5, 0.0, 0.0], (21, 1))
+
+    def solved(**bounds):
+        problem = C3Problem(
+            weights, projection, C3Options(N=20, rounds=5), C3Bounds(**bounds)
+        )
+        return solve_c3(lcs, x0, x_desired, problem)[0]
+
+    with pytest.raises(C3Failure, match="no plan meets the bounds"):
+        solved(x_upper=np.array([np.inf, np.inf, np.inf, -0.02]))
+    # One that a push can meet is met by pushes.
+    plan = solved(
+        x_lower=np.array([-np.inf, -np.inf, -np.inf, -0.02]),
+        x_upper=np.array([np.inf, x0[1] + 0.05, np.inf, np.inf]),
+    )
+    assert plan.lam.min() >= 0.0 and plan.x[1:, 1].max() <= x0[1] + 0.05 + 1e-6
 
 
 def plan_exists(lcs, x0, problem):

@@ -1,5 +1,6 @@
 """Motion patterns: geometry by arc length, time, files, demonstrations, bad input."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from makebreak.systems.changing_contact.numerics.demonstration import (
 from makebreak.systems.changing_contact.numerics.motion_pattern import (
     MotionPattern,
     Segment,
+    least_time,
     load_pattern,
     pattern_from,
     save_pattern,
@@ -320,3 +322,23 @@ def test_a_bad_demonstration_is_refused(what):
         message = "n >= 20"
     with pytest.raises(ValueError, match=message):
         pattern_from_demonstration(t, pose, force)
+
+
+@pytest.mark.parametrize("turn", [45, 90, 135, 160, 170])
+@pytest.mark.parametrize("a_max", [0.5, 5.0])
+def test_a_corner_too_sharp_for_its_speed_is_refused_and_has_a_least_time(turn, a_max):
+    """v^2 kappa, by finite differences of the reference, within acceleration_max."""
+    angle = np.deg2rad(turn)
+    points = np.array([[0.3, 0, 0.3], [0.5, 0, 0.3], [0.5, 0, 0.3]])
+    points[2, :2] += 0.2 * np.array([np.cos(angle), np.sin(angle)])
+    segment = Segment("spline", points, [0.0, 1.0])
+    least = least_time(segment, a_max)
+    for share in (0.9, 0.99):
+        with pytest.raises(ValueError, match="bends within|expected more time"):
+            MotionPattern((replace(segment, times=[0.0, share * least]),), a_max)
+    pattern = MotionPattern((replace(segment, times=[0.0, 1.001 * least]),), a_max)
+    times = np.linspace(0.0, pattern.duration, 20001)
+    p = np.array([pattern.pose(t)[:3] for t in times])
+    a = np.diff(p, n=2, axis=0) / (times[1] - times[0]) ** 2
+    largest = np.linalg.norm(a, axis=1).max()
+    assert 0.9 * a_max < largest <= 1.02 * a_max

@@ -15,11 +15,10 @@ from scipy.spatial.transform import Rotation
 from makebreak.systems.changing_contact.numerics.motion_pattern import (
     MotionPattern,
     Segment,
-    segment_time,
+    least_time,
     unit_rows,
 )
 
-MOST_SEC = 1e6  # A segment that takes so long is slow enough for every bend.
 SLOWEST = 0.002  # [m/s]: a tip that is slower counts as standing.
 AXES = tuple(sign * row for row in np.eye(3) for sign in (1.0, -1.0))
 
@@ -118,20 +117,14 @@ def pattern_from_demonstration(
             * Rotation.from_quat(base, scalar_first=True)
         ).as_quat(scalar_first=True)
         kind = "line" if len(chosen) == 2 else "spline"
-        length = np.linalg.norm(np.diff(chosen[:, :3], axis=0), axis=1).sum()
-        least = 1.001 * np.sqrt(4.0 * 2.0 * 1.2 * length / acceleration_max)
-        duration = max(float(grid[end] - grid[first]), least)
         segment = Segment(
-            kind, chosen[:, :3], np.array([clock, clock + MOST_SEC]), quaternions,
+            kind, chosen[:, :3], np.array([0.0, 1.0]), quaternions,
             normals[on], np.array(targets),
         )  # fmt: skip
-        slowly = MotionPattern((segment,), acceleration_max, base)
-        length, bend = slowly.length(0), slowly.largest_curvature(0)
-        if bend > 0.0:  # A corner is passed no faster than acceleration_max allows.
-            fast = np.sqrt(acceleration_max * min(1.0 / bend, 0.5 * length))
-            duration = max(
-                duration, segment_time(length, 0.999 * fast, acceleration_max)
-            )
+        duration = max(
+            float(grid[end] - grid[first]),
+            1.002 * least_time(segment, acceleration_max),
+        )
         segments.append(replace(segment, times=np.array([clock, clock + duration])))
         clock += duration
         start, start_r = chosen[-1, :3], chosen[-1, 3:]

@@ -15,7 +15,7 @@ pose and force ... segments that are (each) assumed to be smooth, continuous, an
 jerk-free").
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -41,6 +41,7 @@ from makebreak.systems.changing_contact.numerics.path_geometry import (
     START,
     TARGETS,
     arc_data,
+    largest_curvature,
     line_data,
     path_point,
     rotation_motion,
@@ -54,7 +55,8 @@ from makebreak.systems.changing_contact.numerics.velocity_profile import (
 KINDS = ("line", "arc", "spline")
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)  # Tool down: then frame tip's axes are the world's.
 _POSITION_TOL, _ANGLE_TOL = 1e-6, 1e-6  # [m], [rad]: rounding of a file's digits.
-_LOOKED_AT = 513  # Points of a path among which it bends most.
+_AGES = 1e4  # [s] In which any segment is passed slowly.
+_SLACK = 1.001  # Of acceleration_max in a bend: rounding of times.
 _TURN_MAX = np.deg2rad(170.0)  # Of any orientation from the first: rotation vectors.
 
 
@@ -147,11 +149,11 @@ class Segment:
 class MotionPattern:
     """Segments in a row; see the module.
 
-    Args: segments; acceleration_max, along the path, of every change of speed [m/s2];
+    Args: segments; acceleration_max, of every change of speed and in every bend [m/s2];
         base, quaternion wxyz from which rotation vectors are taken, None: the first
         orientation (it matters only where two patterns are to be blended).
     Raises: ValueError that names the segment: times that are not in order, a gap to the
-        one before, too little time for its length.
+        one before, too little time for its length or for its bends (least_time).
     """
 
     segments: tuple[Segment, ...]
@@ -213,6 +215,13 @@ class MotionPattern:
             except ValueError as error:
                 raise ValueError(f"segment {k}: {error}") from None
             table[head + SPEED] = speed
+            bend = 0.0 if one.kind == "line" else largest_curvature(table, k)
+            if speed**2 * bend > _SLACK * a:
+                raise ValueError(
+                    f"segment {k} bends within {1.0 / bend:.3g} m at {speed:.4g} m/s, "
+                    f"expected at most {np.sqrt(a / bend):.4g} m/s there: more time or "
+                    f"a rounder path (acceleration_max is {a:.4g} m/s2)"
+                )
             before = speed if table[head + GOES_ON] else 0.0
         table.setflags(write=False)
         base = base.copy()
@@ -241,9 +250,8 @@ class MotionPattern:
         return self._head(k, SPEED)
 
     def largest_curvature(self, k: int) -> float:
-        """Of segment k [1/m], among _LOOKED_AT of its points."""
-        points = np.linspace(0.0, self.length(k), _LOOKED_AT)
-        return max(float(np.linalg.norm(self.geometry(k, s)[2])) for s in points)
+        """Of the path of segment k [1/m]."""
+        return float(largest_curvature(self.table, k))
 
     def ends_in_contact(self, k: int) -> bool:
         """Whether the next segment has a force direction that segment k lacks."""
@@ -412,6 +420,21 @@ def segment_time(
             f"{np.sqrt(length * acceleration_max / max(ramps, 1)):.4g} m/s"
         )
     return length / speed + ramps * speed / acceleration_max
+
+
+def least_time(
+    segment: Segment, acceleration_max: float, starts=True, stops=True
+) -> float:
+    """The least time [s] in which a segment keeps acceleration_max [m/s2], at its ends
+    (`starts` from rest, `stops` at rest) and in its bends; its own times do not count.
+    """
+    slowly = replace(segment, times=np.array([0.0, _AGES]))
+    alone = MotionPattern((slowly,), acceleration_max)
+    length, bend = alone.length(0), alone.largest_curvature(0)
+    radius = min(1.0 / bend if bend > 0.0 else np.inf, 0.5 * length)
+    return segment_time(
+        length, np.sqrt(acceleration_max * radius), acceleration_max, starts, stops
+    )
 
 
 # --- Files.

@@ -27,6 +27,7 @@ HEAD = 24
 KIND, LENGTH, SPEED, N_FORCE = 0, 1, 2, 3
 DIRECTIONS, TARGETS = 4, 10  # Of the forces: two rows of three, two numbers.
 IN_CONTACT, IN_LOSS, GOES_ON, START, END, DATA = 12, 13, 14, 15, 16, 17
+BENDS_AT = 513  # Points of a path among which it bends most.
 _DEGREE = 7
 _NODES, _WEIGHTS = (0.5 * x for x in np.polynomial.legendre.leggauss(12))
 _NODES = _NODES + 0.5
@@ -162,6 +163,16 @@ def path_point(table, segment, s):
         out[2, i] = d2[i] * v1**2 + d1[i] * v2
         out[3, i] = d3[i] * v1**3 + 3.0 * d2[i] * v1 * v2 + d1[i] * v3
     return out
+
+
+@numba.njit(cache=True)
+def largest_curvature(table, segment):
+    """Of the position along `segment` [1/m], among BENDS_AT of its points."""
+    length, most = table[1 + segment * HEAD + LENGTH], 0.0
+    for i in range(BENDS_AT):
+        bend = path_point(table, segment, length * i / (BENDS_AT - 1))[2]
+        most = max(most, bend[0] ** 2 + bend[1] ** 2 + bend[2] ** 2)
+    return np.sqrt(most)
 
 
 def line_data(X0, X1):

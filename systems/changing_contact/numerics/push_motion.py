@@ -18,6 +18,7 @@ import numpy as np
 from makebreak.systems.changing_contact.numerics.motion_pattern import (
     MotionPattern,
     Segment,
+    least_time,
     segment_time,
 )
 
@@ -111,7 +112,11 @@ def ball_pattern(config, start, heading, radius_ball, radius_tip, a_max):
     n /= np.linalg.norm(n)
     points = np.array([start, rise, over, fall, end])
     way = np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
-    seconds = config.reposition_sec * max(1.0, way / REFERENCE_WAY)
+    over_it = _segment("spline", points, 0.0, 1.0)
+    seconds = max(
+        config.reposition_sec * max(1.0, way / REFERENCE_WAY),
+        least_time(over_it, a_max, stops=False),
+    )
     return MotionPattern(
         (
             _segment("spline", points, 0.0, seconds),

@@ -179,7 +179,12 @@ def qp_step(model, weights, bounds, given, found):
     solve(fac, h, x0, lam0, x, v)
     if bounds is not None:
         lower, upper = bounds
-        if not within(x, v, lower, upper):
+        if not within(x, v[:, n_lam:], lower[n_lam:], upper[n_lam:]):
+            # No contact may pull more than it does without bounds.
+            lower = lower.copy()
+            for i in range(n_lam):
+                for k in range(N):
+                    lower[i] = min(lower[i], v[k, i])
             status = solve_bounded(fac, T, Q_N, h, x0, lam0, lower, upper, sides, x, v)
             if status != MET:  # Bounds of inputs alone can always be met.
                 free = np.isinf(lower[n_v:]).all() and np.isinf(upper[n_v:]).all()

@@ -3,7 +3,9 @@
 Its Newton steps are the recursion of c3_qp.py with a larger diagonal. c3_bounds.py says
 when it is used.
 
-Source: Nocedal, Wright, "Numerical Optimization", algorithm 16.4 (predictor-corrector).
+Source: Nocedal, Wright, "Numerical Optimization", algorithm 16.4 (predictor-corrector);
+steps that close breaches no faster than they lower the complementarity: Kojima,
+Megiddo, Mizuno, Math. Programming 61 (1993).
 """
 
 import numpy as np
@@ -16,7 +18,10 @@ from makebreak.systems.contact_mpc.numerics.c3_qp import factor, new_factor, sol
 # before, and then an iterate of the second, looser size is a solution ...
 IPM_TOLERANCE, IPM_ACCEPTED = 1e-12, 1e-8
 # ... and it has failed after so many steps.
-IPM_STEPS = 80
+IPM_STEPS = 160
+# A step is short where a bound stops it before this share: the iterate is then far from
+# the central path, and the next one mostly centres.
+SHORT, CENTRING = 0.3, 0.95
 # It starts with each bound's complementarity at so many times the free plan's cost:
 # far from the bounds, whose multipliers may be millions of times what they start from
 # where an object is light. Rounding may make the factorisation fail there: then nearer.
@@ -71,7 +76,7 @@ def solve_interior(fac, T, T_N, h, v0_fixed, lower, upper, start, x, v):
                 count += 1
     if count == 0:
         return True
-    least_price, residual, careful = 1e-14 * mu / start, 1.0, False
+    least_price, residual, sigma = 1e-14 * mu / start, 1.0, 0.0
     best, found = np.inf, False
     diagonal, g, h_step = (
         np.zeros((N + 1, n)),
@@ -98,8 +103,10 @@ def solve_interior(fac, T, T_N, h, v0_fixed, lower, upper, start, x, v):
         if not factor(step, T, T_N, diagonal, v0_fixed.size):
             break
         for predictor in (True, False):
-            target = 0.3 * mu if careful else 0.0
-            if not predictor and careful:
+            # A centred step takes off a share 1 - sigma of the complementarity, and of
+            # the breaches no more: else it runs into the bounds, and stays there.
+            target, share = sigma * mu, 1.0 - sigma
+            if not predictor and sigma > 0.0:
                 break  # The one step has been found.
             if not predictor:
                 # How far the predictor got says how much to centre.
@@ -124,7 +131,7 @@ def solve_interior(fac, T, T_N, h, v0_fixed, lower, upper, start, x, v):
                         dz[side, k, i] = target - ds[side, k, i] * dz[side, k, i]
                         push = (
                             dz[side, k, i]
-                            - z[side, k, i] * (gap[side, k, i] - s[side, k, i])
+                            - z[side, k, i] * share * (gap[side, k, i] - s[side, k, i])
                         ) / s[side, k, i]
                         h_step[k, i] += push if side == 0 else -push
             solve(step, h_step, zero_x, zero_v, dx, dv)
@@ -134,7 +141,8 @@ def solve_interior(fac, T, T_N, h, v0_fixed, lower, upper, start, x, v):
                     for i in range(n):
                         if active[side, k, i]:
                             move = dy[k, i] if side == 0 else -dy[k, i]
-                            s_new = gap[side, k, i] + move
+                            breach = gap[side, k, i] - s[side, k, i]
+                            s_new = s[side, k, i] + share * breach + move
                             ds[side, k, i] = s_new - s[side, k, i]
                             dz[side, k, i] = (
                                 dz[side, k, i] - z[side, k, i] * s_new
@@ -152,9 +160,11 @@ def solve_interior(fac, T, T_N, h, v0_fixed, lower, upper, start, x, v):
                         z[side, k, i] += alpha * dz[side, k, i]
                         mu += s[side, k, i] * z[side, k, i]
         mu /= count
-        residual *= 1.0 - alpha
+        residual *= 1.0 - alpha * (1.0 - sigma)
         # The second-order correction can cycle; a plain centred step does not.
-        careful = mu > 0.7 * mu_last
+        sigma = 0.3 if mu > 0.7 * mu_last else 0.0
+        if alpha < SHORT:
+            sigma = CENTRING
         if not np.isfinite(mu):
             break
         price = max(_distance(T, T_N, y, y_free, n_v), least_price)

@@ -110,7 +110,11 @@ class C3Options:
 
 @dataclass
 class C3Bounds:
-    """Of every u_k and of x_1 .. x_N; None, or infinite entries: no bound."""
+    """Of every u_k and of x_1 .. x_N; None, or infinite entries: no bound.
+
+    Bounds of states are not met by contacts that pull: no contact's force lam is below
+    zero and below the least that it has in the same QP without bounds.
+    """
 
     u_lower: np.ndarray | None = None  # (n_u,) [N]
     u_upper: np.ndarray | None = None  # (n_u,) [N]
@@ -150,8 +154,12 @@ class C3Problem:
         self.n_lam = n_contact // 2 if self.is_plus else n_contact
         self._check_consensus_weights(n_contact)
         bounds = C3Bounds() if bounds is None else bounds
-        self.lower = self._bound(-np.inf, u=bounds.u_lower, x=bounds.x_lower)
-        self.upper = self._bound(np.inf, u=bounds.u_upper, x=bounds.x_upper)
+        self.upper = self._bound(np.inf, np.inf, u=bounds.u_upper, x=bounds.x_upper)
+        lower = self._bound(-np.inf, -np.inf, u=bounds.u_lower, x=bounds.x_lower)
+        i_x = self.n_lam + self.n_u
+        if not np.isinf(np.r_[lower[i_x:], self.upper[i_x:]]).all():
+            lower = self._bound(-np.inf, 0.0, u=bounds.u_lower, x=bounds.x_lower)
+        self.lower = lower
         for i in np.flatnonzero(~(self.lower <= self.upper)):
             raise ValueError(
                 f"C3Bounds: {self.lower[i]} to {self.upper[i]} for entry "
@@ -209,9 +217,9 @@ class C3Problem:
                 "without cost, expected R + G > 0"
             )
 
-    def _bound(self, unbounded, u, x):
-        """A bound over [lam, u, x]; lam has none here (the projection keeps it)."""
-        parts = [np.full(self.n_lam, unbounded)]
+    def _bound(self, unbounded, lam, u, x):
+        """A bound over [lam, u, x]."""
+        parts = [np.full(self.n_lam, lam)]
         for name, value, n in (("u", u, self.n_u), ("x", x, self.n_x)):
             part = np.full(n, unbounded) if value is None else np.asarray(value, float)
             if part.shape != (n,) or np.isnan(part).any():

@@ -93,34 +93,38 @@ def solve_lcp_kernel(F, q):
     status = NOT_PRECISE
     # A pivot below the tolerance is taken for rounding. Where that was wrong the check
     # at the end says so, and another tolerance is tried, or a tableau without the
-    # rounding errors of many pivots.
-    for tolerance, rebuild in (
-        (1e-11, 0),
-        (1e-11, REBUILD),
-        (1e-9, REBUILD),
-        (1e-13, REBUILD),
+    # rounding errors of many pivots; or the unit of the largest closing speed, beside
+    # which gaps that open far faster decide no tie.
+    closing, best, found = -b.min(), np.inf, np.zeros(n)
+    for tolerance, rebuild, unit in (
+        (1e-11, 0, 1.0),
+        (1e-11, 0, closing),
+        (1e-11, REBUILD, 1.0),
+        (1e-9, REBUILD, 1.0),
+        (1e-13, REBUILD, 1.0),
     ):
-        z, status = _lemke(M, b, tolerance, rebuild)
+        z, status = _lemke(M, b / unit, tolerance, rebuild)
         if status == SOLVED:
-            if _violation(M, b, z) < 1e-9:
-                for i in range(n):
-                    lam[i] = scale[i] * largest * z[i]
-                return lam, SOLVED
-            status = NOT_PRECISE
+            status, wrong = NOT_PRECISE, _violation(M, b, unit * z)
+            if wrong < best:
+                best, found = wrong, unit * z
+            if best < 1e-9:
+                break
     # Where feasible w leave no room (a wedge), rounding in q alone makes a ray. Then a
     # slightly regular F tells: its w is wrong by 1e-12 z, which stays below 1e-9 if
     # there is a solution, and does not shrink with the 1e-12 if there is none.
     # Lemke's path may also end in a ray although there is a solution, where M is not
     # positive semi-definite, and rounding may break it where it nearly is not: hence
     # the search. Where that finds nothing either, 1e-7 has to do.
-    if not (
-        _regular(M, b, 1e-12, 0, z) < 1e-9
-        or _search(M, b, z)
-        or _regular(M, b, 1e-8, REBUILD, z) < 1e-7
-    ):
-        return lam, status
+    if not best < 1e-9:
+        if _regular(M, b, 1e-12, 0, z) < 1e-9 or _search(M, b, z):
+            found = z
+        elif not best < 1e-7:
+            if not _regular(M, b, 1e-8, REBUILD, z) < 1e-7:
+                return lam, status
+            found = z
     for i in range(n):
-        lam[i] = scale[i] * largest * z[i]
+        lam[i] = scale[i] * largest * found[i]
     return lam, SOLVED
 
 
