@@ -382,7 +382,8 @@ def combinations(repeats: int):
     The cost is always that of the inputs rolled out with exact Stewart-Trinkle contact
     forces, as its contacts do not open while they slide.
     """
-    found, real = [], ball_lcs(4, StewartTrinkle())
+    found: list[dict] = []
+    real = ball_lcs(4, StewartTrinkle())
     for plus in (True, False):
         _, x0, x_desired, p = ball(plus, 10)
         for name, law in (("Anitescu", Anitescu()), ("S.-T.", StewartTrinkle())):
