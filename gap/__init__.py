@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     )
     from makebreak.gap.data.recording import Recording as Recording
     from makebreak.gap.data.table import write_recording as write_recording
+    from makebreak.gap.design import LogDesign as LogDesign, LogPlan as LogPlan
     from makebreak.gap.report.files import write_report as write_report
     from makebreak.gap.result import GapResult as GapResult
     from makebreak.gap.workflow import run_gap as run_gap

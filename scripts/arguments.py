@@ -292,6 +292,43 @@ def make_parser(functions: Mapping[str, Callable]) -> argparse.ArgumentParser:
     )  # fmt: skip
 
     p = commands.add_parser(
+        "design-log",
+        help="design the motion to record, that tells parameters of a model best",
+    )
+    p.add_argument(
+        "scene", metavar="SCENE", help="a scene file, or a robot's .urdf or .sdf"
+    )
+    p.add_argument(
+        "--for", dest="parameters", action="append", default=[], nargs="+",
+        metavar="KIND[@PLACE]",
+        help="kinds of effects whose parameters are to be told (default: friction, "
+        "rotors, masses and centres of mass)",
+    )  # fmt: skip
+    for option, default, says in (
+        ("--seconds", "20", "length of the log, rounded to periods"),
+        ("--period", "10", "seconds after which the motion repeats"),
+        ("--harmonics", "5", "highest frequency, in units of 1/period"),
+    ):
+        p.add_argument(option, default=default, metavar="N", help=f"{says} ({default})")
+    p.add_argument(
+        "--rate", dest="rate_hz", default="100", metavar="HZ",
+        help="samples of the log in a second (100)",
+    )  # fmt: skip
+    p.add_argument(
+        "--noise", default="0.01", metavar="SHARE",
+        help="noise of a measured effort, as a share of the joint's limit (0.01)",
+    )  # fmt: skip
+    for quantity in ("velocity", "acceleration", "effort"):
+        p.add_argument(
+            f"--{quantity}", metavar="LIMIT",
+            help=f"limit of {quantity} in place of the model's: a number for all "
+            "joints, or JOINT=NUMBER,...",
+        )  # fmt: skip
+    p.add_argument(
+        "--out", metavar="DIR", help="output folder (runs/design-log-<time>)"
+    )
+
+    p = commands.add_parser(
         "inspect",
         help="show the columns or topics of a log, with rates, missing samples, units",
     )

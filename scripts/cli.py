@@ -239,6 +239,31 @@ def _judge(args) -> int:
     return 0
 
 
+def _design_log(args) -> int:
+    from makebreak.gap.design import LogPlan
+    from makebreak.scripts.design_command import design_log, limits_of
+
+    plan = LogPlan(
+        number(args.seconds, "--seconds", 0.0),
+        number(args.period, "--period", 0.0),
+        int(number(args.harmonics, "--harmonics", 2, whole=True)),
+        number(args.rate_hz, "--rate", 0.0),
+        number(args.noise, "--noise", 0.0),
+        limits_of(args.velocity, "--velocity"),
+        limits_of(args.acceleration, "--acceleration"),
+        limits_of(args.effort, "--effort"),
+    )
+    path = Path(args.scene)
+    if not path.is_file():
+        path = Path(scene_file(args.scene, "SCENE"))
+    out = Path(args.out) if args.out else default_out("design-log")
+    named = [name for group in args.parameters for name in group]
+    table, files = design_log(path, named, plan, out)
+    show(table)
+    print_files(files)
+    return 0
+
+
 def _inspect(args) -> int:
     from makebreak.scripts.inspect_command import run_inspect, run_repair
 
@@ -373,6 +398,7 @@ _COMMANDS: dict[str, Callable[[Namespace], int]] = {
     "sweep": _sweep,
     "gap": _gap,
     "judge": _judge,
+    "design-log": _design_log,
     "inspect": _inspect,
     "close-the-loop": _close_the_loop,
     "export-tests": _export_tests,

@@ -8,7 +8,7 @@ here="$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")"
 "$here/setup.sh"
 
 case "${1:-}" in
-    list | run | station | reproduce | sweep | gap | judge | inspect | \
+    list | run | station | reproduce | sweep | gap | judge | design-log | inspect | \
         close-the-loop | export-tests | compile | bench | completion) ;;
     --version | --help | -h) ;;
     *) set -- run "$@" ;;
