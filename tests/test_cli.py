@@ -381,7 +381,14 @@ def test_ctrl_c_ends_a_run_cleanly_and_keeps_what_was_recorded(
         assert table["time"][-1] > 1.0
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize(
+    "number",
+    [
+        signal.SIGINT,
+        pytest.param(signal.SIGTERM, marks=pytest.mark.slow),
+        pytest.param(signal.SIGHUP, marks=pytest.mark.slow),
+    ],
+)
 def test_ctrl_c_ends_reproduce_and_all_its_runs(number, start):
     process = start("reproduce", "--seeds", "2", "--jobs", "2", "--out", "out",
                     SPRING_MASS_SECONDS="1e6")  # fmt: skip

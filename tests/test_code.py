@@ -12,6 +12,7 @@ import pytest
 
 from makebreak.scripts.experiments import EXPERIMENTS, load_experiment
 from makebreak.systems.moved import MOVED
+from makebreak.systems.numerics.code_cache import user_cache
 
 ROOT = Path(__file__).resolve().parent.parent
 ROOMS = ("models", "systems", "diagrams", "gap", "scripts")
@@ -172,7 +173,7 @@ def test_code_is_formatted():
     reason="arrays have other types in numpy 2.2, the last for Python 3.10",
 )
 def test_types_are_right():
-    done = run_module("mypy")
+    done = run_module("mypy", "--cache-dir", str(user_cache() / "mypy"))
     assert done.returncode == 0, done.stdout + done.stderr
 
 

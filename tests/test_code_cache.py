@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from numba.core.registry import CPUDispatcher
 
-from makebreak.systems.numerics import code_cache
+from makebreak.systems.numerics import code_cache, filters
 from makebreak.systems.numerics.code_cache import digest
 
 ROOT = Path(__file__).parents[1]
@@ -125,6 +125,15 @@ def test_another_copy_compiles_only_what_has_changed(tmp_path):
     with (two / "systems/numerics/filters.py").open("a") as file:
         file.write("# Changed.\n")
     assert [compiles(two), compiles(one)] == ["True", "False"]
+
+
+def test_code_with_checked_indices_is_other_code(monkeypatch):
+    file, function = ROOT / "systems/numerics/filters.py", filters._low_pass.py_func
+    plain = code_cache.BySource(function, file)
+    monkeypatch.setattr(code_cache.CONFIG, "BOUNDSCHECK", 1)
+    assert code_cache.BySource(function, file).get_cache_path() != (
+        plain.get_cache_path()
+    )
 
 
 def test_what_is_long_out_of_use_is_deleted(tmp_path):

@@ -208,8 +208,17 @@ def test_of_declared_filters_nothing_is_invented(tmp_path, low_pass, declared):
 
 @pytest.mark.parametrize(
     "declared, lag",
-    [(None, 1 / (2 * np.pi * 20.0)), ("first order, 40 Hz", 1 / (4 * np.pi * 20.0))],
-    ids=["undeclared", "declared too fast"],
+    [
+        pytest.param(
+            None,
+            1 / (2 * np.pi * 20.0),
+            id="undeclared",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            "first order, 40 Hz", 1 / (4 * np.pi * 20.0), id="declared too fast"
+        ),
+    ],
 )
 def test_a_filter_that_is_not_declared_is_found(tmp_path, declared, lag):
     result = pendulum(tmp_path, first_order(20.0), declared)

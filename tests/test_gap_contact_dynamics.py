@@ -72,7 +72,7 @@ def fitted(model: ContactDynamics, kind: str, at: str, start: dict, names) -> di
     return dict(zip(names, found.x * scale, strict=True)), left
 
 
-@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@pytest.mark.parametrize("sign", [pytest.param(-1.0, marks=pytest.mark.slow), 1.0])
 @pytest.mark.parametrize("wrench", [True, False])
 def test_friction_is_measured_by_what_forces_cannot_explain(tmp_path, sign, wrench):
     scene, recordings, truth = pushed(
@@ -89,7 +89,7 @@ def test_friction_is_measured_by_what_forces_cannot_explain(tmp_path, sign, wren
     assert after < 0.6 * before
 
 
-@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@pytest.mark.parametrize("sign", [-1.0, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_mass_is_measured(tmp_path, sign):
     scene, recordings, truth = pushed(tmp_path, 12, ["object_mass"], sign)
     model = ContactDynamics(scene, recordings)

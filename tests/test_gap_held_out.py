@@ -81,7 +81,11 @@ def test_of_four_trials_the_last_is_held_out_and_not_the_end_of_each(
 
 @pytest.mark.parametrize(
     ("make_files", "spoil"),
-    [(mechanism, noise), (rolling, shrunk), (touching, shrunk)],
+    [
+        (mechanism, noise),
+        pytest.param(rolling, shrunk, marks=pytest.mark.slow),
+        (touching, shrunk),
+    ],
 )
 def test_garbage_in_what_is_reported_on_changes_no_parameter(
     tmp_path, make_files, spoil

@@ -170,8 +170,15 @@ def test_velocities_that_come_late_are_no_softer_wall(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("rows", "shift"), [(2, 0), (4, 0), (2, 2), (1, 0), (2, 5)]
-)  # fmt: skip
+    ("rows", "shift"),
+    [
+        pytest.param(2, 0, marks=pytest.mark.slow),
+        pytest.param(4, 0, marks=pytest.mark.slow),
+        (2, 2),
+        (1, 0),
+        (2, 5),
+    ],
+)
 def test_commands_of_a_faster_loop_act_where_free_motion_says(tmp_path, rows, shift):
     """Every `rows`-th row of a loop is logged, its commands as of `shift` rows before:
     on the mean they act so much earlier, or later, than if held from row to row. More
@@ -311,7 +318,7 @@ def test_a_wall_that_stands_elsewhere_is_found_by_what_runs_against_it(tmp_path)
     assert np.sqrt(np.mean(end.r**2)) < 1.1 < np.sqrt(np.mean(start.r**2))
 
 
-@pytest.mark.parametrize("times", [1.0, 10.0])
+@pytest.mark.parametrize("times", [1.0, pytest.param(10.0, marks=pytest.mark.slow)])
 def test_a_soft_bumper_that_is_struck_is_not_pressed_on(tmp_path, times):
     """A strike goes deeper than a tool that presses may be in a face. It goes so deep
     by the scene's own softness, or, where the scene is ten times as stiff, as if the

@@ -129,7 +129,7 @@ def test_a_block_of_the_modelled_mass_is_no_gap(tmp_path, rng):
     assert result.verdict == "no_gap", result.says
 
 
-@pytest.mark.parametrize("factor", [0.75, 1.3])
+@pytest.mark.parametrize("factor", [pytest.param(0.75, marks=pytest.mark.slow), 1.3])
 def test_the_mass_of_a_block_on_a_rail_is_named(tmp_path, rng, factor):
     scene = write_scene(tmp_path, factor * MASS)
     result = run_gap(scene, [write_log(tmp_path, rng)])

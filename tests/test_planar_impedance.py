@@ -207,7 +207,7 @@ def tracking(config, seed=0, knowledge=None):
     return np.array(errors), diagram, context
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_springs_are_countered_softly_in_the_first_trial(seed):
     config = LAW
     ours, diagram, context = tracking(config, seed)

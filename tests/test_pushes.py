@@ -112,7 +112,15 @@ COMES_BACK = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("hidden", COMES_BACK)
+@pytest.mark.parametrize(
+    "hidden",
+    [
+        name
+        if name in ("saturation", "wave")
+        else pytest.param(name, marks=pytest.mark.slow)
+        for name in COMES_BACK
+    ],
+)
 def test_what_acts_rarely_and_comes_back_is_no_push(tmp_path, hidden):
     scene, file = recorded(tmp_path, COMES_BACK[hidden])
     problem = MechanismProblem(scene, read_recordings([file]))

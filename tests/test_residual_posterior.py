@@ -380,7 +380,7 @@ def test_each_of_two_contacts_gets_its_own_residual_and_deviation(left, right, d
     assert (abs(r - [left, right]) < 2.0 * std).all() and std.max() < 3e-3
 
 
-@pytest.mark.parametrize("error", [-8e-3, 8e-3])
+@pytest.mark.parametrize("error", [pytest.param(-8e-3, marks=pytest.mark.slow), 8e-3])
 def test_what_was_learned_stays_where_nothing_is_touched(error):
     """One wall is 8 mm off; the mass then floats for ten minutes 3 mm before it."""
     model = between_walls(1.0, 0.03)

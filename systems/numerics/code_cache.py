@@ -77,7 +77,8 @@ class BySource(caching._CacheLocator):
     def __init__(self, function, file: Path):
         self._py_file = str(file)
         self._line = function.__code__.co_firstlineno
-        self._digest = digest(file)
+        # Code with checked indices is other code, which Numba does not notice.
+        self._digest = digest(file) + "checked" * bool(CONFIG.BOUNDSCHECK)
         self._path = user_cache() / "compiled" / f"{function.__module__}-{self._digest}"
 
     def get_cache_path(self) -> str:
