@@ -1,17 +1,26 @@
-"""From an arm's URDF and a log in degrees to what the URDF lacks."""
+"""From an arm's URDF and a log in degrees to what the URDF lacks.
 
+python examples/gap_of_an_arm.py [FOLDER]: scene, log and report are in FOLDER.
+"""
+
+import sys
 import tempfile
 from pathlib import Path
 
 import numpy as np
 import pydrake.all as drake
 
-from makebreak.gap import run_gap
+from makebreak.gap import run_gap, write_report
+from makebreak.models.scene import read_scene
 
-folder, arm = Path(tempfile.mkdtemp()), '<robot name="arm"><link name="base"/>'
+folder = Path(sys.argv[1] if len(sys.argv) > 1 else tempfile.mkdtemp())
+folder.mkdir(parents=True, exist_ok=True)
+arm = '<robot name="arm"><link name="base"/>'
 for parent, joint, link, z in ("base", "j1", "upper", 0), ("upper", "j2", "fore", -0.3):
     arm += f"""<link name="{link}"><inertial><origin xyz="0 0 -.15"/><mass value="1"/>
-    <inertia ixx=".01" iyy=".01" izz=".002" ixy="0" ixz="0" iyz="0"/></inertial></link>
+    <inertia ixx=".01" iyy=".01" izz=".002" ixy="0" ixz="0" iyz="0"/></inertial>
+    <visual><origin xyz="0 0 -.15"/><geometry><cylinder radius=".03" length=".3"/>
+    </geometry></visual></link>
     <joint name="{joint}" type="continuous"><parent link="{parent}"/><axis xyz="0 1 0"/>
     <child link="{link}"/><origin xyz="0 0 {z}"/></joint>"""
 (folder / "arm.urdf").write_text(arm + "</robot>")
@@ -44,3 +53,5 @@ np.savetxt(folder / "log.csv", rows, delimiter=",", header=header, comments="")
 
 result = run_gap(folder / "scene.yaml", [folder / "log.csv"])
 print(*(each.says for each in result.effects))
+write_report(result, read_scene(folder / "scene.yaml"), folder / "report")
+print("Its report:", folder / "report" / "report.html")

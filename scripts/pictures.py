@@ -24,7 +24,8 @@ from makebreak.systems.changing_contact.numerics.velocity_profile import (
     speed_transition,
 )
 
-DOCS = Path(__file__).resolve().parent.parent / "docs" / "pictures"
+ROOT = Path(__file__).resolve().parent.parent
+DOCS, EXAMPLES = ROOT / "docs" / "pictures", ROOT / "examples"
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,7 @@ class Picture:
     wait_ms: int = 15000
     size: tuple[int, int] = (1280, 800)
     live_sec: float = 0.0
+    before: str = ""  # An example that makes the files of the command, in a folder.
 
 
 def _figure(experiment: str, plot: str) -> Picture:
@@ -54,7 +56,12 @@ PICTURES = {
     ),
     "cube_pivoting.png": Picture("run cube_pivoting", "motion.png"),
     "gap_report.png": Picture(_LOOP, "2_gap/report.html", 5000, (1265, 725)),
-    "gap_compare.png": Picture(_LOOP, "2_gap/compare.html", 12000),
+    "gap_compare.png": Picture(
+        "gap OUT/arm/scene.yaml OUT/arm/log.csv",
+        "compare.html",
+        12000,
+        before="gap_of_an_arm.py OUT/arm",
+    ),
     "ball_rolling_diagram.svg": Picture(
         "run ball_rolling --duration 0.1 --no-meshcat --diagram OUT/d.svg", "d.svg"
     ),
@@ -116,6 +123,9 @@ def make_pictures(names: list[str], out: Path, work: Path) -> None:
             _photograph(PICTURES[pictures[0]], folder, out / pictures[0])
             print(f"    {out / pictures[0]}", flush=True)
             continue
+        if example := PICTURES[pictures[0]].before.replace("OUT", str(folder)):
+            script, where = example.split(maxsplit=1)
+            subprocess.run([sys.executable, EXAMPLES / script, where], check=True)
         done = subprocess.run(
             [*makebreak_command(*words), "--out", str(folder)],
             capture_output=True,

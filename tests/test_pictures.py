@@ -34,9 +34,14 @@ def test_one_run_gives_all_its_pictures_and_a_failed_one_is_told(tmp_path, monke
         folder = Path(command[-1])
         if "close-the-loop" in command:
             (folder / "2_gap").mkdir(parents=True)
-            for name in ("report", "compare"):
-                (folder / "2_gap" / f"{name}.html").write_text(name)
+            (folder / "2_gap" / "report.html").write_text("report")
             return SimpleNamespace(returncode=1)  # Its goals are not met.
+        if str(command[1]).endswith("gap_of_an_arm.py"):
+            folder.mkdir(parents=True)
+            (folder / "log.csv").write_text("log")
+        if "gap" in command:
+            assert (folder / "arm" / "log.csv").is_file()
+            (folder / "compare.html").write_text("compare")
         status = 2 if "cube_pivoting" in command else 0
         return SimpleNamespace(returncode=status, stderr="...\nit broke\n")
 
@@ -47,7 +52,7 @@ def test_one_run_gives_all_its_pictures_and_a_failed_one_is_told(tmp_path, monke
     monkeypatch.setattr(pictures, "screenshot", screenshot)
     out = tmp_path / "out"
     make_pictures(["gap_report.png", "gap_compare.png"], out, tmp_path / "a b")
-    assert len(ran) == 1
+    assert len(ran) == 3
     assert (out / "gap_report.png").read_text() == "report"
     assert (out / "gap_compare.png").read_text() == "compare"
     with pytest.raises(RuntimeError, match="run cube_pivoting: it broke"):
