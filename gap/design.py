@@ -26,8 +26,14 @@ from makebreak.models.effects.signature import Motion
 from makebreak.models.scene import Scene
 from makebreak.models.typed_yaml import nearest
 
-FRICTION = ("joint_viscous_damping", "joint_coulomb_friction", "rotor_inertia")
-LINKS = ("link_mass", "link_com")  # Nuisances where they are not named.
+# Kinds that URDF and MJCF have numbers for: of joints friction and rotors, of links
+# masses and centres of mass, which are nuisances where they are not named.
+JOINTS = tuple(n for n, k in KINDS.items() if k.at == "joint" and k.exported)
+LINKS = tuple(
+    n for n, k in KINDS.items()
+    if k.at == "body" and k.exported and not k.absolute
+    and not any(p.optional for p in k.parameters)
+)  # fmt: skip
 PLACES = ("joint", "actuator", "body", "base")
 TURN = np.pi  # [rad] To each side, of a joint without limits of position.
 # A parameter that a log leaves at this share of what was known before is not told.
@@ -159,7 +165,7 @@ class LogDesign:
             for name in self.dynamics.signatures(kind, [at], motion)[0].unknowns:
                 p = known.get(name)
                 size = np.inf if p is None else 0.5 * (p.high - p.low)
-                if kind == "link_mass":
+                if kind in LINKS and p is not None and p.unit == "kg":
                     size = masses[at]
                 if (kind, at) not in self.named:
                     size = _tolerance(scene, kind, masses[at])
@@ -197,16 +203,20 @@ def _periods(plan: LogPlan) -> int:
 
 
 def _tolerance(scene: Scene, kind: str, mass: float) -> float:
-    """How well a link is known, as of an object."""
-    known = KINDS[kind.replace("link", "object")].tolerance
-    assert known is not None
+    """How well a link is known: as an object whose own value has the same unit."""
+    (known,) = {
+        k.tolerance
+        for k in KINDS.values()
+        if k.tolerance is not None and k.absolute
+        and k.parameters[0].unit == KINDS[kind].parameters[0].unit
+    }  # fmt: skip
     share = scene.tolerance.get(known.key, known.default)
     return share * mass if known.relative else share
 
 
 def _named(dynamics: SceneDynamics, words: Sequence[str]) -> list[tuple[str, str]]:
     found: list[tuple[str, str]] = []
-    for word in words or (*FRICTION, *LINKS):
+    for word in words or (*JOINTS, *LINKS):
         kind, _, at = word.partition("@")
         if kind not in KINDS:
             raise ValueError(f"--for: no kind {kind}; {nearest(kind, KINDS)}")
@@ -216,7 +226,7 @@ def _named(dynamics: SceneDynamics, words: Sequence[str]) -> list[tuple[str, str
         if not places or not _is_linear(dynamics, kind, places[0]):
             raise ValueError(
                 f"--for: {kind} is not linear in the efforts of this scene; expected "
-                f"one as {', '.join((*FRICTION, *LINKS, 'payload'))}"
+                f"one as {', '.join((*JOINTS, *LINKS))}"
             )
         if at and at not in places:
             raise ValueError(f"--for: {kind} cannot be at {at}; {nearest(at, places)}")

@@ -1,9 +1,10 @@
-"""Exports a scene's mechanism with its effects as URDF or MJCF.
+"""Exports a scene's mechanism with its effects as URDF, MJCF or drives of Isaac Lab.
 
 Both formats have inertias, damping, Coulomb friction (which Drake's parser ignores) and
 rotor inertias. Effects that a format cannot express are listed in `omitted`.
 """
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +32,7 @@ from makebreak.models.effects.kind import (
     find_joints,
     full_name,
     model_of,
+    one_dof_joints,
     sentence,
 )
 from makebreak.models.effects.model_text import (
@@ -41,6 +43,7 @@ from makebreak.models.effects.model_text import (
     write_inertial,
 )
 from makebreak.models.scene import LoadedScene, Scene, load_scene
+from makebreak.models.scene_schema import COMMANDS_OF
 
 
 @dataclass(frozen=True)
@@ -220,45 +223,141 @@ def _pose(joint: Joint) -> dict[str, str]:
 
 
 def _mjcf_joint(loaded: LoadedScene, joint: Joint, body, motors) -> None:
-    plant, name = loaded.plant, full_name(loaded.plant, joint)
+    name = full_name(loaded.plant, joint)
     turns = isinstance(joint, RevoluteJoint)
     axis = joint.revolute_axis() if turns else joint.translation_axis()
     X_BM = joint.frame_on_child().GetFixedPoseInBodyFrame()
-    law = law_of(loaded.scene.actuation, name)
-    damping = float(joint.default_damping_vector()[0])
-    if law is not None:  # The motor's back-EMF acts as damping.
-        damping += float(law.emf)
+    drive = _drive_of(loaded, joint)
     attributes = {
         "name": name,
         "type": "hinge" if turns else "slide",
         "pos": _numbers(X_BM.translation()),
         "axis": _numbers(X_BM.rotation() @ axis),
-        "damping": repr(damping),
-        "frictionloss": repr(_dry_friction(loaded, joint)),
-        "armature": repr(_rotor(plant, joint)),
+        "damping": repr(drive.damping),
+        "frictionloss": repr(drive.friction),
+        "armature": repr(drive.armature),
     }
     low, high = joint.position_lower_limit(), joint.position_upper_limit()
     if np.isfinite([low, high]).all():
         attributes["range"] = _numbers([low, high])
-    ET.SubElement(body, "joint", attributes)
-    actuator = actuator_of(plant, joint)
-    if actuator is None or name not in loaded.scene.actuation.joints:
+    element = ET.SubElement(body, "joint", attributes)
+    if not drive.is_driven:
         return
-    limit = actuator.effort_limit()
-    if law is None:
-        attributes = {"name": name, "joint": name}
-        if np.isfinite(limit):
-            attributes["ctrlrange"] = _numbers([-limit, limit])
-        ET.SubElement(motors, "motor", attributes)
+    on, span = {"name": name, "joint": name}, _numbers([-drive.limit, drive.limit])
+    is_limited = np.isfinite(drive.limit)
+    if not drive.takes:
+        limit = {"ctrlrange": span} if is_limited else {}
+        ET.SubElement(motors, "motor", on | limit)
         return
-    kp, limit = _kp(loaded, name, float(law.kp)), min(limit, float(law.limit))
-    gains = {"kp": repr(kp), "kv": repr(float(law.kd))}
-    if kp == 0.0:
-        gains = {"kv": repr(float(law.kd))}
-    attributes = {"name": name, "joint": name, **gains}
-    if np.isfinite(limit):
-        attributes["forcerange"] = _numbers([-limit, limit])
-    ET.SubElement(motors, "position" if kp else "velocity", attributes)
+    if len(drive.takes) == 2:  # A second actuator adds kd times the commanded velocity.
+        ET.SubElement(
+            motors, "position", on | {"kp": repr(drive.kp), "kv": repr(drive.kd)}
+        )
+        speed = {"name": f"{name}.velocity", "joint": name, "gear": repr(drive.kd)}
+        ET.SubElement(motors, "motor", speed)
+        if is_limited:  # Of both together.
+            element.set("actuatorfrcrange", span)
+        return
+    limit = {"forcerange": span} if is_limited else {}
+    if drive.kp == 0.0:
+        ET.SubElement(motors, "velocity", on | {"kv": repr(drive.kd)} | limit)
+    else:
+        gains = {"kp": repr(drive.kp), "kv": repr(drive.kd)}
+        ET.SubElement(motors, "position", on | gains | limit)
+
+
+@dataclass(frozen=True)
+class _Drive:
+    """What a joint and its drive do, in numbers of other simulators. takes: commands of
+    its control loop, of COMMANDS_OF; none: efforts. limit: of effort, of the motor.
+    damping: with the motor's back-EMF."""
+
+    is_driven: bool
+    takes: tuple[str, ...]
+    kp: float
+    kd: float
+    limit: float
+    damping: float
+    friction: float
+    armature: float
+    delay: float  # [s] Of its commands.
+
+
+def _drive_of(loaded: LoadedScene, joint: Joint) -> _Drive:
+    plant, name = loaded.plant, full_name(loaded.plant, joint)
+    actuation, actuator = loaded.scene.actuation, actuator_of(plant, joint)
+    law = law_of(actuation, name)
+    damping = float(joint.default_damping_vector()[0])
+    limit = np.inf if actuator is None else float(actuator.effort_limit())
+    kp = kd = 0.0
+    if law is not None:
+        damping += float(law.emf)
+        limit = min(limit, float(law.limit))
+        kp, kd = _kp(loaded, name, float(law.kp)), float(law.kd)
+    return _Drive(
+        actuator is not None and name in actuation.joints,
+        () if law is None else COMMANDS_OF[actuation.type],
+        kp, kd, limit, damping, _sum_of(loaded, joint, "friction"),
+        _rotor(plant, joint), _sum_of(loaded, joint, "delay"),
+    )  # fmt: skip
+
+
+# A simulation in Isaac Lab, and what it may not have.
+_ISAAC_LAB = '''\
+"""The drives of a repaired model, for Isaac Lab 2.2 and newer (with Isaac Sim 5 and
+newer, where joint friction is an effort).
+
+    ArticulationCfg(..., actuators=ACTUATORS)
+
+The law is effort = clip(stiffness (target - q) + damping (velocity target - v) + effort
+target), with targets that arrive late by the delay. Masses and inertias are not here:
+`--export urdf` has them.
+"""
+
+from isaaclab.actuators import DelayedPDActuatorCfg
+
+PHYSICS_DT = 0.005  # [s] Of your simulation: delays are whole steps of it.
+
+ACTUATORS = {
+'''
+
+
+def to_isaac_lab(scene: Scene) -> Exported:
+    """The scene's drives as a Python module for Isaac Lab: a DelayedPDActuatorCfg for
+    the joints of each delay, with stiffness, damping, effort limit, armature and
+    friction.
+
+    Raises: ValueError as to_mjcf, or if the scene drives no joint.
+    """
+    loaded = _load(scene)
+    plant = loaded.plant
+    groups: dict[float, dict[str, _Drive]] = {}
+    for joint in one_dof_joints(plant):
+        drive = _drive_of(loaded, joint)
+        if drive.is_driven and not _is_added(model_of(plant, joint)):
+            groups.setdefault(drive.delay, {})[re.escape(joint.name())] = drive
+    if not groups:
+        raise ValueError("--export isaaclab: the scene drives no joint")
+    text = _ISAAC_LAB
+    for k, (delay, drives) in enumerate(sorted(groups.items())):
+        values = {
+            "effort_limit": [min(d.limit, 1e9) for d in drives.values()],
+            "stiffness": [d.kp for d in drives.values()],
+            "damping": [d.kd for d in drives.values()],
+            "armature": [d.armature for d in drives.values()],
+            "friction": [d.friction for d in drives.values()],
+            "dynamic_friction": [d.friction for d in drives.values()],
+            "viscous_friction": [d.damping for d in drives.values()],
+        }
+        text += f'    "drives_{k + 1}": DelayedPDActuatorCfg(\n'
+        text += f"        joint_names_expr={list(drives)!r},\n"
+        for name, numbers in values.items():
+            each = dict(zip(drives, numbers, strict=True))
+            text += f"        {name}={each!r},\n"
+        for name in ("min_delay", "max_delay"):
+            text += f"        {name}=round({delay!r} / PHYSICS_DT),\n"
+        text += "    ),\n"
+    return Exported(text + "}\n", _unsaid(scene, ("delay",)))
 
 
 def _urdf_joint(loaded: LoadedScene, joint: Joint, document) -> list[str]:
@@ -272,7 +371,7 @@ def _urdf_joint(loaded: LoadedScene, joint: Joint, document) -> list[str]:
     if not found:
         found = [element.appendChild(document.createElement("dynamics"))]
     found[0].setAttribute("damping", repr(float(joint.default_damping_vector()[0])))
-    found[0].setAttribute("friction", repr(_dry_friction(loaded, joint)))
+    found[0].setAttribute("friction", repr(_sum_of(loaded, joint, "friction")))
     rotor = _rotor(plant, joint)
     if rotor == 0.0:
         return []
@@ -300,13 +399,14 @@ def _rotor(plant: MultibodyPlant, joint: Joint) -> float:
 
 
 def _exported_as(loaded: LoadedScene, attribute: str) -> list[Effect]:
-    """The effects that are exported as "friction" or "kp"."""
+    """The effects that are exported as "friction", "kp" or "delay"."""
     return [e for e in loaded.effects if KINDS[e.kind].exported == attribute]
 
 
-def _dry_friction(loaded: LoadedScene, joint: Joint) -> float:
+def _sum_of(loaded: LoadedScene, joint: Joint, attribute: str) -> float:
+    """Of effects that are exported as the attribute."""
     total = 0.0
-    for effect in _exported_as(loaded, "friction"):
+    for effect in _exported_as(loaded, attribute):
         (value,) = effect.parameters.values()
         if any(j.index() == joint.index() for j in find_joints(effect, loaded.plant)):
             total += value
@@ -321,9 +421,11 @@ def _kp(loaded: LoadedScene, joint: str, kp: float) -> float:
     return kp
 
 
-def _unsaid(scene: Scene) -> tuple[str, ...]:
+def _unsaid(scene: Scene, more: Sequence[str] = ()) -> tuple[str, ...]:
+    """Sentences of the effects that are not said; more: attributes that a format has
+    besides those of all."""
     return tuple(
         sentence(effect, KINDS[effect.kind])
         for effect in scene.effects
-        if not KINDS[effect.kind].exported
+        if KINDS[effect.kind].exported not in ("inertia", "friction", "kp", *more)
     )

@@ -273,7 +273,8 @@ def make_parser(functions: Mapping[str, Callable]) -> argparse.ArgumentParser:
     p.add_argument(
         "--export",
         metavar="FORMATS",
-        help="also write the repaired model as urdf, mjcf, or urdf,mjcf",
+        help="also write the repaired model: urdf, mjcf, isaaclab (its drives), or "
+        "several of them, separated by commas",
     )
 
     p = commands.add_parser(

@@ -32,7 +32,7 @@ from makebreak.scripts.outputs import OutputFolder
 from makebreak.scripts.shown import is_quiet, print_files
 from makebreak.scripts.table import Table
 
-EXPORTS = ("urdf", "mjcf")
+EXPORTS = ("urdf", "mjcf", "isaaclab")
 NO_ANIMATION = "compare.html was not made"
 
 
@@ -288,12 +288,17 @@ def name_from(folder: Path, robot: Path, proposed_scene: Path) -> None:
 
 def exported(scene: Scene, formats: Sequence[str]) -> dict[str, str]:
     """{file name: text} of a scene's models in other formats: `repaired.xml` (MJCF),
-    and `<model>.urdf` for each model that comes from a URDF. Effects that a format
-    cannot express are listed in a comment at its end.
+    `isaaclab_actuators.py`, and `<model>.urdf` for each model that comes from a URDF.
+    Effects that a format cannot express are listed in a comment at its end.
 
     Raises: ValueError for an unknown format, or a scene that it cannot express.
     """
-    from makebreak.models.model_export import to_mjcf, to_urdf, urdf_models
+    from makebreak.models.model_export import (
+        to_isaac_lab,
+        to_mjcf,
+        to_urdf,
+        urdf_models,
+    )
 
     found = {}
     for each in formats:
@@ -304,14 +309,18 @@ def exported(scene: Scene, formats: Sequence[str]) -> dict[str, str]:
         if each == "mjcf":
             found["repaired.xml"] = to_mjcf(scene)
             continue
+        if each == "isaaclab":
+            found["isaaclab_actuators.py"] = to_isaac_lab(scene)
+            continue
         models = urdf_models(scene)
         if not models:
             raise ValueError("--export urdf: no model of the scene comes from a URDF")
         found |= {f"{model}.urdf": to_urdf(scene, model) for model in models}
     texts = {}
     for name, one in found.items():
+        comment = "# {}\n" if name.endswith(".py") else "<!-- {} -->\n"
         lost = "".join(
-            f"<!-- Not in this file: {effect} -->\n" for effect in one.omitted
+            comment.format(f"Not in this file: {effect}") for effect in one.omitted
         )
         texts[name] = one.text + lost
     return texts

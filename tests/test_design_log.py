@@ -204,10 +204,11 @@ HIDDEN = (
 
 
 def played(scene, commands, rng):
-    """A log of MuJoCo's: the true arm follows the commands under a stiff law, its
-    efforts are measured with PLAN's noise."""
+    """A log of MuJoCo's: the true arm follows commands of 1 kHz under a stiff law, its
+    efforts are measured, 100 a second, with PLAN's noise."""
     model = mujoco.MjModel.from_xml_string(to_mjcf(scene).text)
     data, time = mujoco.MjData(model), commands["time"]
+    assert model.opt.timestep == pytest.approx(time[1])
     q, v, effort = (
         np.column_stack([commands[f"d.j{k}.{what}_command"] for k in (1, 2)])
         for what in ("position", "velocity", "effort")
@@ -215,19 +216,16 @@ def played(scene, commands, rng):
     data.qpos[:] = q[0]
     rows = []
     for k in range(len(time)):
-        mujoco.mj_forward(model, data)
         at, speed = data.qpos.copy(), data.qvel.copy()
-        data.ctrl[:] = effort[k] + 300.0 * (q[k] - at) + 20.0 * (v[k] - speed)
+        data.ctrl[:] = effort[k] + 200.0 * (q[k] - at) + 10.0 * (v[k] - speed)
         rows.append([time[k], *at, *data.ctrl])
-        for _ in range(10):
-            mujoco.mj_step(model, data)
-    rows = np.array(rows)
-    rows[:, 1:3] += 1e-4 * rng.normal(size=(len(time), 2))
-    rows[:, 3:] += 0.15 * rng.normal(size=(len(time), 2))
-    names = [
-        "time",
-        *(f"d.j{k}.{w}" for w in ("position", "effort_measured") for k in (1, 2)),
-    ]
+        mujoco.mj_step(model, data)
+    rows = np.array(rows[::10])
+    assert np.abs(rows[:, 1:3] - q[::10]).max() < 0.05  # It follows.
+    rows[:, 1:3] += 1e-4 * rng.normal(size=(len(rows), 2))
+    rows[:, 3:] += 0.15 * rng.normal(size=(len(rows), 2))
+    whats = ("position", "effort_measured")
+    names = ["time", *(f"d.j{k}.{what}" for what in whats for k in (1, 2))]
     return dict(zip(names, rows.T, strict=True))
 
 
@@ -248,7 +246,8 @@ def test_gap_knows_more_from_a_designed_log_than_from_random_ones(tmp_path):
         motions.append(wanted.problem.within(wanted.problem.motion_of(x), 0.95))
     widths = []
     for k, excitation in enumerate(motions):
-        log = played(truth, replace(found, excitation=excitation).columns(), rng)
+        fine = replace(found, excitation=excitation, plan=replace(plan, rate_hz=1e3))
+        log = played(truth, fine.columns(), rng)
         write_recording(tmp_path / f"log_{k}.csv", log)
         result = run_gap(tmp_path / "scene.yaml", [tmp_path / f"log_{k}.csv"])
         told = {(e.kind, e.at[0]): e.parameters for e in result.effects}

@@ -1,5 +1,7 @@
 """A repaired scene as MJCF and URDF: the same mechanism in MuJoCo and in Drake."""
 
+import sys
+import types
 from dataclasses import replace
 
 import mujoco
@@ -61,13 +63,13 @@ def test_mass_matrix_and_forces_are_those_of_drake(tmp_path):
     np.testing.assert_allclose(model.dof_frictionloss, [0.4, 0.0])
 
 
-@pytest.mark.parametrize("drive", ["effort", "servo"])
+@pytest.mark.parametrize("drive", ["effort", "servo", "pd"])
 def test_mujoco_replays_what_drake_simulates(tmp_path, drive):
     actuation = ActuationSection(type="effort", joints=list(JOINTS))
     more = []
-    if drive == "servo":
+    if drive != "effort":
         actuation = ActuationSection(
-            type="servo", joints=list(JOINTS), kp=[40.0], kd=[0.5], limit=[14.0, 5.0],
+            type=drive, joints=list(JOINTS), kp=[40.0], kd=[0.5], limit=[14.0, 5.0],
             supply=SupplySection(voltage=[24.0], kt=[1.0], resistance=[1.0]),
         )  # fmt: skip
         more = [("servo_gain", "d.j2", dict(kp=25.0))]
@@ -79,6 +81,10 @@ def test_mujoco_replays_what_drake_simulates(tmp_path, drive):
         f"{joint}.{what}": size / (1 + k) * np.sin(5.0 * times + k)
         for k, joint in enumerate(JOINTS)
     }
+    if drive == "pd":
+        for k, joint in enumerate(JOINTS):
+            speed = 5.0 * size / (1 + k) * np.cos(5.0 * times + k)
+            commands[f"{joint}.velocity_command"] = speed
     start = {"d.j1": 0.4, "d.j2": -0.6}
     channels = [f"{joint}.position" for joint in JOINTS]
     rows = SceneSimulation(scene).run(
@@ -89,12 +95,80 @@ def test_mujoco_replays_what_drake_simulates(tmp_path, drive):
     replayed = []
     for k in range(len(times)):
         replayed.append(np.array(data.qpos))
-        data.ctrl[:] = [u[k] for u in commands.values()]
+        for name, u in commands.items():
+            joint, what = name.rsplit(".", 1)
+            more = ".velocity" if what == "velocity_command" else ""
+            data.actuator(joint + more).ctrl = u[k]
         for _ in range(50):
             mujoco.mj_step(model, data)
     # A first-order scheme of 1 ms, and dry friction as MuJoCo has it (soft).
     np.testing.assert_allclose(replayed, rows, atol=0.01)
     assert np.ptp(rows, axis=0).min() > 0.3
+
+
+def test_drives_for_isaac_lab_do_in_mujoco_what_ours_do(tmp_path, monkeypatch):
+    """Isaac Lab is not here: its law, as it is documented, on a mechanism without
+    drives, friction and rotors, which all come from the written module."""
+    late = ("input_delay", "d.j2", dict(delay=0.05))
+    actuation = ActuationSection(
+        type="pd", joints=list(JOINTS), kp=[40.0], kd=[1.5], limit=[9.0, 5.0]
+    )
+    scene = replace(double(tmp_path), actuation=actuation)
+    scene = with_effects(
+        scene, *SAID, ("servo_gain", "d.j2", dict(kp=25.0)), late, LOST
+    )
+    exported_module = exported(scene, ["isaaclab"])["isaaclab_actuators.py"]
+    assert "# Not in this file: joint d.j1 has drag" in exported_module
+    assert "late" not in exported_module.rpartition("}")[2]
+    actuators = types.ModuleType("isaaclab.actuators")
+    actuators.DelayedPDActuatorCfg = lambda **values: values
+    monkeypatch.setitem(sys.modules, "isaaclab", types.ModuleType("isaaclab"))
+    monkeypatch.setitem(sys.modules, "isaaclab.actuators", actuators)
+    made: dict = {}
+    exec(exported_module.replace("PHYSICS_DT = 0.005", "PHYSICS_DT = 0.001"), made)
+    of = {}
+    for group in made["ACTUATORS"].values():
+        assert group["min_delay"] == group["max_delay"]
+        for name in group["joint_names_expr"]:
+            of[name] = {k: v[name] for k, v in group.items() if isinstance(v, dict)}
+            of[name]["delay"] = group["min_delay"]
+    assert [of[name]["delay"] for name in ("j1", "j2")] == [0, 50]
+
+    without = [each for each in scene.effects if each.kind != LOST[0]]
+    times = np.arange(0.0, 1.5, 0.05)
+    start = {"d.j1": 0.4, "d.j2": -0.6}
+    commands = {
+        f"{joint}.{what}_command": 0.6 * size * wave(5.0 * times + k)
+        for what, size, wave in (("position", 1.0, np.sin), ("velocity", 5.0, np.cos))
+        for k, joint in enumerate(JOINTS)
+    }
+    rows = SceneSimulation(replace(scene, effects=without)).run(
+        at_rest_but(start), times, [f"{j}.position" for j in JOINTS],
+        Commands(times, commands),
+    )  # fmt: skip
+    model, data = in_mujoco(to_mjcf(replace(scene, effects=without)).text)
+    for name, drive in of.items():
+        (i,) = model.joint(f"d.{name}").dofadr
+        model.dof_armature[i], model.dof_damping[i] = (
+            drive["armature"], drive["viscous_friction"],
+        )  # fmt: skip
+        model.dof_frictionloss[i] = drive["friction"]
+        assert drive["dynamic_friction"] == drive["friction"]
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
+    data.qpos[:] = list(start.values())
+    replayed, whats = [], ("position", "velocity")
+    for k in range(50 * len(times)):
+        if k % 50 == 0:
+            replayed.append(np.array(data.qpos))
+        for i, (name, drive) in enumerate(of.items()):
+            row = max(k - drive["delay"], 0) // 50
+            p, v = (commands[f"d.{name}.{w}_command"][row] for w in whats)
+            u = drive["stiffness"] * (p - data.qpos[i])
+            u += drive["damping"] * (v - data.qvel[i])
+            limit = drive["effort_limit"]
+            data.qfrc_applied[i] = np.clip(u, -limit, limit)
+        mujoco.mj_step(model, data)
+    np.testing.assert_allclose(replayed, rows, atol=0.01)  # As above.
 
 
 def test_a_urdf_has_what_the_repaired_scene_has(tmp_path):

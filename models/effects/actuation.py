@@ -153,6 +153,7 @@ KINDS = {
         at="actuator",
         parameters=(Parameter("delay", "s", 0.0, 0.1, valid=">= 0"),),
         says="commands reach {at} {delay} late",
+        exported="delay",
         confused_with=("sensor_delay", "actuator_lag", "joint_viscous_damping"),
         tell_apart="excite above 1/(2 pi delay), and record when commands are received",
         path="delay",

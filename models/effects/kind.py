@@ -121,7 +121,8 @@ class EffectKind:
         known exactly.
     may_lack: parameters without which it is a candidate of its own.
     exported: how URDF and MJCF express it: "inertia" (also damping and rotors: they are
-        in the plant), "friction" or "kp" (its only parameter); "": not at all.
+        in the plant), "friction" or "kp" (its only parameter), "delay" (for Isaac Lab
+        alone); "": not at all.
 
     What it does in Drake; a kind has only the steps that it needs:
     check(effect): raises ValueError for parameters that do not fit together.
