@@ -76,6 +76,11 @@ class Budget:
         if now >= end:
             raise Stopped
 
+    def share(self, n: int) -> "Budget":
+        """A budget of one of n that come one after another, of what is left."""
+        left = self._start + self.seconds - monotonic()
+        return Budget(max(left / n, 1e-3), self._is_asked, self._tick)
+
     def in_a_copy(self) -> None:
         """In a copy of the process: nothing is shown from there."""
         self._tick = lambda: None

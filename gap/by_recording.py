@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from makebreak.gap.by_part import pooled
 from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.fit import fit_effects
 from makebreak.gap.problem import GapProblem, is_sane, rms
 from makebreak.gap.result import (
     Differs,
     Estimate,
-    GapMeasure,
     GapResult,
     NamedEffect,
     Trust,
@@ -168,7 +168,7 @@ def with_differences(
             result, says=f"{result.says} {words}", differs=tuple(differs.values())
         )
     effects = _effects(found, differs, each)
-    gap = _pooled([one.result.gap for one in each])
+    gap = pooled([one.result.gap for one in each])
     is_tied = any(one.result.verdict == "ambiguous" for one in each)
     named = " ".join(e.says for e in effects)
     return replace(
@@ -349,44 +349,6 @@ def _surest(named: NamedEffect) -> float:
             if p.fitted
         ),
         default=np.inf,
-    )
-
-
-def _pooled(gaps: Sequence[GapMeasure]) -> GapMeasure:
-    """Over the windows of all recordings."""
-    weight = np.array([max(g.n_windows, 1) for g in gaps], float)
-    weight /= weight.sum()
-
-    def pool(values) -> float:
-        return float(np.sqrt(np.sum(weight * np.square(list(values)))))
-
-    channels = [c for c in gaps[0].per_channel if all(c in g.per_channel for g in gaps)]
-    units = [c for c in gaps[0].in_units if all(c in g.in_units for g in gaps)]
-    joints = [c for c in gaps[0].equations if all(c in g.equations for g in gaps)]
-
-    def in_units(of, names):
-        return {
-            c: replace(
-                of[0][c], before=pool(g[c].before for g in of),
-                after=pool(g[c].after for g in of),
-            )
-            for c in names
-        }  # fmt: skip
-
-    return replace(
-        gaps[0],
-        before=pool(g.before for g in gaps),
-        after=pool(g.after for g in gaps),
-        per_channel={
-            c: {w: pool(g.per_channel[c][w] for g in gaps) for w in ("before", "after")}
-            for c in channels
-        },
-        in_units=in_units([g.in_units for g in gaps], units),
-        equations=in_units([g.equations for g in gaps], joints),
-        n_windows=sum(g.n_windows for g in gaps),
-        failed=(sum(g.failed[0] for g in gaps), sum(g.failed[1] for g in gaps)),
-        data="reported" if all(g.data == "reported" for g in gaps) else "chosen on",
-        seconds=sum(g.seconds for g in gaps),
     )
 
 

@@ -17,6 +17,7 @@ from makebreak.gap.budget import (
     go_on,
     present,
 )
+from makebreak.gap.by_part import joined, limbs_of, only
 from makebreak.gap.by_recording import (
     Alone,
     Together,
@@ -207,17 +208,61 @@ def _run(
         asked(dynamics, parts.decided)
         for asked in (runs_against, presses, push_each_other)
     )
-    decided, reported, done = _conditioned(parts, dynamics, is_mechanism and not meets)
     seconds["checks"] = clock.lap()
+    limbs = limbs_of(dynamics, parts.decided) if is_mechanism and not meets else []
+    if len(limbs) < 2:
+        result = _compared(scene, dynamics, parts, meets, checks, jobs, say, clock)
+        return replace(result, seconds={**seconds, **result.seconds})
+
+    def of_limb(k: int) -> GapResult:
+        of_scene, of_parts = only(limbs[k], scene, parts)
+        of_checks, name = list(checks), f"{limbs[k][0]} and on"
+        with budget.share(1 if jobs > 1 else len(limbs) - k).running() as own:
+            try:
+                result = _compared(
+                    of_scene, SceneDynamics(of_scene), of_parts, False, of_checks, 1,
+                    lambda text: say(text if text[0] == " " else f"{text}, {name}"),
+                    _Clock(),
+                )  # fmt: skip
+            except Stopped:
+                own.leave(f"comparing {name}")
+                result = nothing_compared(of_checks)
+        return replace(result, unfinished=tuple(own.undone))
+
+    results = list(side_by_side([partial(of_limb, k) for k in range(len(limbs))], jobs))
+    result = joined(limbs, results)
+    for what in result.unfinished:
+        budget.leave(what)
+    return replace(result, seconds={**seconds, **result.seconds})
+
+
+def _compared(
+    scene: Scene,
+    dynamics: SceneDynamics,
+    parts: Split,
+    meets: bool,
+    checks: list[Finding],
+    jobs: int,
+    say: Callable[[str], None],
+    clock: "_Clock",
+) -> GapResult:
+    """What a scene and recordings come to, of which nothing but checks is known.
+
+    Args: meets: whether a mechanism touches something, or itself. checks: findings are
+        added there.
+    """
+    budget, seconds = present(), {}
+    is_mechanism = _is_mechanism(dynamics, parts.decided)
+    decided, reported, done = _conditioned(parts, dynamics, is_mechanism and not meets)
     say("preparing motions and windows")
-    problem, found = problem_for(scene, decided, dynamics, jobs)
+    problem, found = problem_for(scene, decided, dynamics, jobs, meets)
     if isinstance(problem, MechanismProblem) and problem.commands_are_samples():
         parts = replace(
             parts, decided=sampled_commands.as_samples(parts.decided),
             reported=sampled_commands.as_samples(parts.reported),
         )  # fmt: skip
         decided, reported, done = _conditioned(parts, dynamics, not meets)
-        problem, found = problem_for(scene, decided, dynamics, jobs)
+        problem, found = problem_for(scene, decided, dynamics, jobs, meets)
         found.append(sampled_commands.finding(decided))
     checks += [*done, *found]
     seconds["screen"] = clock.lap()
@@ -251,7 +296,7 @@ def _run(
         say(f"searching {name} separately")
         mine, its = ([r for r in some if r.name == name]
                      for some in (decided, reported))  # fmt: skip
-        one, _ = problem_for(scene, mine, dynamics, jobs)
+        one, _ = problem_for(scene, mine, dynamics, jobs, meets)
         selected = select(one, say)
         return Alone(name, one, selected, conclude(one, selected, its, checks, jobs))
 
@@ -291,26 +336,27 @@ def problem_for(
     recordings: Sequence[Recording],
     dynamics: SceneDynamics,
     jobs: int = 1,
+    meets: bool = True,
 ) -> tuple[GapProblem, list[Finding]]:
     """The problem that a scene and recordings are, and what was found on the way.
 
-    Args: dynamics: of the scene.
+    Args: dynamics: of the scene. meets: whether a mechanism may touch something.
     Raises: ValueError where no kind of problem fits; and whatever else goes wrong in
         one that does.
     """
     if _is_mechanism(dynamics, recordings):
-        if push_each_other(dynamics, recordings):
+        if meets and push_each_other(dynamics, recordings):
             try:
                 return _contact_problem(scene, recordings)
             except DoesNotFit:  # Too short, or it is no contact that they show.
                 pass
-        if presses(dynamics, recordings):
+        if meets and presses(dynamics, recordings):
             try:
                 pressing = PressingProblem(scene, recordings)
                 return pressing, point_on_face(pressing, pressing.lying())
             except DoesNotFit:  # Too little motion.
                 pass
-        if runs_against(dynamics, recordings):
+        if meets and runs_against(dynamics, recordings):
             try:
                 impacts = ImpactProblem(scene, recordings)
                 return impacts, set_command_times(impacts)

@@ -244,7 +244,12 @@ class SceneDynamics:
         without those that then have no meaning."""
         entry = KINDS[kind]
         if entry.drive:
-            law = law_of(self.loaded.scene.actuation, at[0])
+            actuation = self.loaded.scene.actuation
+            if "." not in at[0]:  # All drives of a model: where they differ, nothing.
+                joints = [j for j in actuation.joints if j.startswith(f"{at[0]}.")]
+                each = [self.now(kind, [joint]) for joint in joints]
+                return each[0] if each and each.count(each[0]) == len(each) else {}
+            law = law_of(actuation, at[0])
             if law is None:
                 raise ValueError(f"no drive at {at[0]}")
             # Effects of the scene may have set it; the last one counts.

@@ -81,6 +81,12 @@ def _in_their_place(
     for k, choice in enumerate(chosen):
         if not search.needs_more(current):
             break
+        places_of = KINDS[choice.effect.kind].at
+        if not any(
+            kind.at == places_of and any(p.refines for p in kind.parameters)
+            for kind in KINDS.values()
+        ):
+            continue
         taken = places(chosen)
         for candidate in search.problem.candidates(search.nuisances, current):
             if (

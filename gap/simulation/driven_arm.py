@@ -74,6 +74,9 @@ class DrivenArmScene:
             if not can_have(effect.kind):
                 raise DoesNotFit(f"effect {effect.kind} takes Drake's own steps")
         plant, body_numbers = self._plant([e for e in every if _in_plant(e.kind)])
+        own = [e for e in every if _of_joint(e.kind)]
+        if own:
+            body_numbers = {**body_numbers, **_with_joints(plant, own)}
         for effect in every:
             possible = KINDS[effect.kind].possible
             if possible is not None:
@@ -207,7 +210,40 @@ def can_have(kind: str) -> bool:
 
 def _in_plant(kind: str) -> bool:
     entry = KINDS[kind]
-    return not (entry.joint_law or entry.path or entry.channel)
+    return not (entry.joint_law or entry.path or entry.channel or _of_joint(kind))
+
+
+def _of_joint(kind: str) -> bool:
+    """Whether it changes a number of a joint, without another plant."""
+    entry = KINDS[kind]
+    numbers = [p.neutral for p in entry.parameters]
+    return bool(entry.at == "joint" and entry.set_in_context and numbers == [0.0])
+
+
+def _with_joints(plant: MultibodyPlant, effects: Sequence[Effect]) -> dict:
+    """Rotors and damping of a plant whose joints have these effects, too.
+
+    Raises: ValueError for effects that it cannot have.
+    """
+    context = plant.CreateDefaultContext()
+    for effect in effects:
+        change = KINDS[effect.kind].set_in_context
+        assert change is not None
+        none = dict.fromkeys(effect.parameters, 0.0)
+        change(Effect(effect.kind, effect.at, none), effect, plant, context)
+    return _joint_numbers(plant, context)
+
+
+def _joint_numbers(plant: MultibodyPlant, context) -> dict:
+    rotor, damping = np.zeros((2, plant.num_velocities()))
+    for joint in one_dof_joints(plant):
+        if joint.num_velocities():
+            damping[joint.velocity_start()] = joint.GetDampingVector(context)[0]
+    for index in plant.GetJointActuatorIndices():
+        actuator = plant.get_joint_actuator(index)
+        at = actuator.joint().velocity_start()
+        rotor[at] += actuator.calc_reflected_inertia(context)
+    return dict(rotor=rotor, damping=damping)
 
 
 def _tree(plant: MultibodyPlant) -> dict:
@@ -270,17 +306,10 @@ def _tree(plant: MultibodyPlant) -> dict:
     p_com = moment / np.where(mass == 0.0, 1.0, mass)[:, None]
     for i, c in enumerate(p_com):
         about[i] -= mass[i] * (c @ c * np.eye(3) - np.outer(c, c))
-    rotor = np.zeros(n)
-    for index in plant.GetJointActuatorIndices():
-        actuator = plant.get_joint_actuator(index)
-        rotor[actuator.joint().velocity_start()] += actuator.calc_reflected_inertia(
-            context
-        )
     return dict(
         parent=parent.astype(np.int64),
         slides=np.array([isinstance(j, PrismaticJoint) for j in joints]),
         R_PJ=R_PJ, p_PJ=p_PJ, axis=axis, mass=mass, p_com=p_com, I_com=about,
-        rotor=rotor,
-        damping=np.array([j.GetDampingVector(context)[0] for j in joints]),
+        **_joint_numbers(plant, context),
         gravity=np.array(plant.gravity_field().gravity_vector()),
     )  # fmt: skip
