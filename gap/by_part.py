@@ -66,8 +66,8 @@ def only(joints: Sequence[str], scene: Scene, parts: Split) -> tuple[Scene, Spli
         scene,
         actuation=replace(
             act, joints=[act.joints[k] for k in kept], supply=supply,
-            **{k: some(getattr(act, k))
-               for k in ("kp", "kd", "limit", "dead_band", "resolution")},
+            kp=some(act.kp), kd=some(act.kd), limit=some(act.limit),
+            dead_band=some(act.dead_band), resolution=some(act.resolution),
         ),
         fixed_joints={**scene.fixed_joints,
                       **{j: said.positions.get(j, 0.0) for j in others}},

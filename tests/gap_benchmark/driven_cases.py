@@ -21,6 +21,7 @@ import yaml
 if __name__ == "__main__":  # The package is found beside the tests.
     sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
+from gap_benchmark.log_cases import COULOMB
 from gap_benchmark.maker import make_cases
 from gap_benchmark.motions import MOTIONS, Motion
 from gap_benchmark.robot_world import Drive, loaded
@@ -41,6 +42,7 @@ SEEDS = {"driven": 100, "driven-final": 70_000}
 STEP = 0.0005  # [s]
 X, Y, Z = ((1.0, 0.0, 0.0),), ((0.0, 1.0, 0.0),), ((0.0, 0.0, 1.0),)
 LINK_MASS = 0.02  # The scene's tolerance, one sigma.
+MOST_KP = 4000.0  # [N m/rad]
 SHOWN = 3.0  # Times the noise by which what is hidden moves its joint, to be needed.
 
 # Of each robot: drive, what is hidden, and: torques (measured), shapes (which can
@@ -243,9 +245,11 @@ def hidden(case: DrivenCase, robot: Robot, drives: Drive, rng) -> list[dict]:
     """Effects with sizes that robots have: like joints have like ones."""
     found, M = [], inertias(robot)
     roles = [re.sub(r"^(leg|finger|left|right)\d*_", "", b.name) for b in robot.moving]
-    size = {"friction": ("joint_coulomb_friction", "coulomb", _dry(robot, drives), 1.0),
-            "damping": ("joint_viscous_damping", "damping", drives.kd, 0.6),
-            "rotors": ("rotor_inertia", "inertia", M, 0.8),
+    dry = _dry(robot, drives)
+    wet = np.minimum(0.6 * drives.kd, 2.0 * dry / robot.fastest)
+    size = {"friction": ("joint_coulomb_friction", "coulomb", dry, 1.0),
+            "damping": ("joint_viscous_damping", "damping", wet, 1.0),
+            "rotors": ("rotor_inertia", "inertia", np.minimum(M, 10.0), 0.8),
             "gains": ("servo_gain", "kp", drives.kp, 0.8)}  # fmt: skip
     for name in case.hide:
         if name == "payload":
@@ -271,8 +275,11 @@ def hidden(case: DrivenCase, robot: Robot, drives: Drive, rng) -> list[dict]:
 
 
 def _dry(robot: Robot, drives: Drive) -> np.ndarray:
-    """(n,) friction of a worn joint [N m]: what its drive gives for an error of 0.04
-    rad, or of a tenth of its speed."""
+    """(n,) friction of a worn joint [N m]: of an arm as its maker's gears have it, else
+    what its drive gives for an error of 0.04 rad, or of a tenth of its speed."""
+    known = {6: COULOMB["six"], 7: COULOMB["panda"]}.get(len(robot.joints))
+    if known is not None:
+        return np.array([most for _, most in known])
     return 0.04 * drives.kp if drives.kp.any() else 0.1 * drives.kd * robot.fastest
 
 
@@ -283,7 +290,8 @@ def _drawn(case: DrivenCase, rng) -> tuple[Robot, Drive]:
         rotor = b.rotor or float(of_link * rng.uniform(0.3, 1.0))
         robot = robot.with_body(f"robot.{b.name}", rotor=rotor, touch=touch)
     n, M, w = len(robot.joints), inertias(robot), 2 * np.pi * rng.uniform(3.0, 6.0)
-    kp, kd = M * w**2, 2.0 * rng.uniform(0.4, 0.9) * w * M
+    kp = np.minimum(M * w**2, MOST_KP)
+    kd = 2.0 * rng.uniform(0.4, 0.9) * np.sqrt(kp * M)
     if case.drive == "velocity":
         kp, kd = np.zeros(n), 60.0 * M
     fast = "fast" in case.options or case.drive in ("velocity", "effort")
