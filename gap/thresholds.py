@@ -3,7 +3,8 @@ them decides, and how it was set.
 
 Errors are held-out rms over noise: 1 is what a perfect model leaves. "The gap" is the
 error of the scene as it came. Unless a line says otherwise, a number was set on the
-development half of the benchmark of logs (docs/gap_measured.md), not on its final half.
+development half of the benchmark of logs (docs/lab/gap_measured.md), not on its final
+half.
 The rules that use them: docs/gap_method.md, "How it works".
 """
 

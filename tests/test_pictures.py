@@ -21,7 +21,7 @@ from makebreak.scripts.pictures import (
 def test_every_picture_of_the_documents_is_there_and_made_by_the_command():
     shown = set()
     root = DOCS.parent.parent
-    for page in [root / "README.md", *root.glob("docs/*.md")]:
+    for page in [root / "README.md", *root.glob("docs/**/*.md")]:
         shown |= set(re.findall(r"pictures/([\w.]+)", page.read_text()))
     assert shown == {p.name for p in DOCS.iterdir()} <= {*PICTURES, *PLOTS}
 
