@@ -24,6 +24,8 @@ from makebreak.gap.data.content import check_contents
 from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.data.robot import propose_scene, read_log, read_robot
 from makebreak.gap.data.scene_facts import scene_facts
+from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.scene import read_scene
 
 RATE = 100.0
 LINK = """<link name="l{k}"><inertial><origin xyz="0 0 {c}"/><mass value="{m}"/>
@@ -66,6 +68,7 @@ class Log:
     joints: int
     limits: list[float]
     slides: list[bool]
+    weight: np.ndarray
     rng: np.random.Generator
     write: Callable[[Path, dict], Path] | None = None
 
@@ -88,11 +91,13 @@ def exact(name: str, folder: Path, rng) -> tuple[Path, Log]:
             a[:, i] -= s * w * w * np.sin(w * t + phase)
     plant, tau = robot.plant, np.zeros_like(q)
     context, forces = plant.CreateDefaultContext(), MultibodyForces(plant)
+    weight = np.zeros_like(q)
     for k in range(len(t)):
         plant.SetPositions(context, q[k])
         plant.SetVelocities(context, v[k])
         plant.CalcForceElementsContribution(context, forces)
         tau[k] = plant.CalcInverseDynamics(context, a[k], forces)
+        weight[k] = -plant.CalcGravityGeneralizedForces(context)
     if rng.random() < 0.5:
         i = int(rng.integers(n))
         tau[:, i] += 0.15 * np.std(tau[:, i]) * np.sign(v[:, i])
@@ -105,7 +110,7 @@ def exact(name: str, folder: Path, rng) -> tuple[Path, Log]:
             short = what.split("_")[0]
             columns[f"joint{i + 1}_{short}"] = y[:, i] + rng.normal(0.0, noise, len(t))
     limits = [j.upper for j in robot.joints]
-    return path, Log(t, columns, truth, n, limits, slides, rng)
+    return path, Log(t, columns, truth, n, limits, slides, weight, rng)
 
 
 def names(log: Log, what: str) -> list[str]:
@@ -130,6 +135,24 @@ def each_gear(log: Log):
     for name, gear in zip(names(log, "effort"), gears, strict=True):
         log.columns[name] = log.columns[name] / gear
     return ("smaller than the model needs",)
+
+
+def noisy_gear(log: Log):
+    """Noise as large as the signal, which makes a factor of least squares too small."""
+    for k, name in enumerate(names(log, "effort")):
+        y = log.columns[name]
+        y = y + np.std(y) * log.rng.normal(size=len(y))
+        log.truth[f"arm.joint{k + 1}.effort_measured"] = y
+        log.columns[name] = y / 50.0
+    return ("smaller than the model needs",)
+
+
+def without_weight(log: Log):
+    """As a controller commands that carries the robot's weight by itself."""
+    for k, name in enumerate(names(log, "effort")):
+        log.columns[name] = log.columns[name] - log.weight[:, k]
+        log.truth[f"arm.joint{k + 1}.effort_measured"] -= log.weight[:, k]
+    return ("gravity: [0.0, 0.0, 0.0]",)
 
 
 def signs(log: Log):
@@ -355,6 +378,8 @@ KINDS = {
     "effort in kgf cm": scaled("effort", 0.0980665, "kgf cm"),
     "effort before one gear": scaled("effort", 50.0, "smaller than the model needs"),
     "effort before gears": each_gear,
+    "noisy effort before a gear": noisy_gear,
+    "effort without weight": without_weight,
     "effort with a constant": scaled("effort", 3.7, "smaller than the model needs"),
     "effort of other sign": signs,
     "one effort of other sign": one_sign,
@@ -437,9 +462,12 @@ def seen(robot_path: Path, log_path: Path, log: Log) -> Seen:
                 np.array(each, float), gains, rtol=0.05
             )
         return Seen(told, True, right)
+    scene = log_path.with_name("proposed_scene.yaml")
+    scene.write_text(proposal.scene)
+    plant = SceneDynamics(read_scene(scene)).plant
     findings = [*proposal.findings(),
-                *check_recordings(recordings, scene_facts(robot.plant)),
-                *check_contents(robot.plant, recordings)]  # fmt: skip
+                *check_recordings(recordings, scene_facts(plant)),
+                *check_contents(plant, recordings)]  # fmt: skip
     words = [*(f"{f.kind} {f.says}" for f in findings), *proposal.notes,
              *proposal.sidecars.values(), proposal.scene]  # fmt: skip
     (recording,) = recordings

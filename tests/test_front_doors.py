@@ -72,6 +72,27 @@ def test_a_rotor_that_the_model_lacks_is_no_factor(tmp_path):
     assert [f.kind for f in found] == []
 
 
+def test_noise_of_a_column_makes_its_factor_no_smaller():
+    """Of 4 N(0, 1) over N(0, 1) with noise of the same size, least squares give 2."""
+    rng = np.random.default_rng(0)
+    x, (a, b) = rng.normal(size=4000), rng.normal(size=(2, 4000))
+    rest = np.ones((4000, 1))
+    # The mean of two halves, each of sqrt(2) times the noise.
+    halves = x + np.sqrt(2.0) * a, x + np.sqrt(2.0) * b
+    found = likeness(4.0 * x, sum(halves) / 2.0, rest, halves)
+    assert found.factor == pytest.approx(4.0, rel=0.1)
+    assert found.explained == pytest.approx(1.0, abs=0.05)
+    assert likeness(4.0 * x, sum(halves) / 2.0, rest).factor < 2.2
+
+
+def test_a_log_of_half_a_second_is_said_to_be_too_short(tmp_path):
+    plant, recording = scene_log(tmp_path, 1.0 / 80.0)
+    short = {c.name: c.values[:60] for c in recording.channels.values()}
+    write_recording(tmp_path / "short.csv", {"time": recording.time[:60]} | short)
+    (finding,) = check_contents(plant, [read_recording(tmp_path / "short.csv")])
+    assert (finding.kind, finding.severity) == ("too_short", "info")
+
+
 def test_the_factor_is_that_of_least_squares_with_friction_free():
     """predicted = 3 column + 2 + 0.5 sign(v), with noise in neither."""
     t = np.linspace(0.0, 10.0, 500)

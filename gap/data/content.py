@@ -6,9 +6,11 @@ what is so predicted for every joint, with dry and viscous friction and a bias f
 
     predicted = factor column + bias + viscous v + coulomb sign(v)
 
-One table of these relations tells a unit, a gear, a motor's side or a torque constant
-(the factor), a sign, columns that are swapped or numbered one off (the joint that
-fits), and a column that drives nothing (no joint fits, or nothing is in it).
+Noise of the column would make the factor too small: half of its samples stand for the
+other half, whose noise is another (instrumental variables). One table of these
+relations tells a unit, a gear, a motor's side or a torque constant (the factor), a
+sign, columns that are swapped or numbered one off (the joint that fits), and a column
+that drives nothing (no joint fits, or nothing is in it).
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,14 +35,22 @@ MOST_SAMPLES = 1000  # At which inverse dynamics is computed.
 MOST_SEC = 60.0  # Of a log that is looked at.
 EXPLAINS, NOTHING = 0.9, 0.5  # Shares of what is predicted: is told by it, is not.
 CLEARER = 5.0  # Times less is left by another joint's column than by its own.
+LEAST_TOLD = 0.3  # Of a column that is not noise, to judge it without that.
 PARTS = 5  # Of the data: a factor scatters over them.
-KNOWN_TO, ALIKE = 0.1, 0.03  # Of a factor, 1 sigma; of factors of one robot.
+KNOWN_TO = 0.1  # Of a factor, 1 sigma.
+# Factors of one robot differ by less than this share, or by so many sigmas.
+ALIKE, SIGMAS = 0.03, 3.0
 # A search takes factors of drives between these for a gain of the actuator; without a
 # gain, masses would have to make up for others.
 GAINS = (0.45, 1.6)
+# Shares of an effort that is the weight's, to tell by; of the weight that one without
+# it may still have.
+WEIGHS, LEFT_OUT = 0.1, 0.2
 # Of one joint alone, what it carries may make its effort so many times larger; what
 # holds it up, smaller.
 LARGE, LARGER = 20.0, 3.0
+WITHOUT_WEIGHT = "effort_without_weight"
+_SEVERITY = {"no_content": "warning", "too_short": "info"}  # Else: an error.
 _DRIVES = ("effort_command", "effort_measured")
 _UNITS = (
     (1e-3, "as if in N mm, or per mille of N m"), (1e-2, "as if in N cm, or per cent"),
@@ -71,10 +81,11 @@ class Said:
     says: str
 
 
-def likeness(predicted, column, rest) -> Likeness | None:
+def likeness(predicted, column, rest, halves=None) -> Likeness | None:
     """None where there is nothing to relate.
 
-    Args: predicted (m,), column (m,), rest (m, k).
+    Args: predicted (m,), column (m,), rest (m, k); halves: the column (m,) by every
+        other sample, twice: their noise is not the same.
     """
     if not (np.ptp(predicted) > 0.0 and np.ptp(column) > 0.0):
         return None
@@ -86,17 +97,38 @@ def likeness(predicted, column, rest) -> Likeness | None:
         off = np.abs(predicted - X @ c)
         good = off <= max(6.0 * float(np.median(off)), 1e-12)
     y, X = predicted[good], X[good]
-    alone = y - X[:, 1:] @ np.linalg.lstsq(X[:, 1:], y, rcond=1e-9)[0]
-    whole = y - X @ np.linalg.lstsq(X, y, rcond=1e-9)[0]
+    alone, own = _without(X[:, 1:], y), _without(X[:, 1:], X[:, 0])
     if not alone @ alone > 1e-12 * max(y @ y, 1e-300):
         return None
-    each = [
-        np.linalg.lstsq(A, b, rcond=1e-9)[0][0]
-        for A, b in zip(np.array_split(X, PARTS), np.array_split(y, PARTS), strict=True)
-    ]
+    whole = _without(X, y)
     share = 1.0 - float(whole @ whole) / float(alone @ alone)
+    one = two = own
+    if halves is not None:
+        one, two = (_without(X[:, 1:], half[good] / size) for half in halves)
+        together = float(one @ two) / max(np.sqrt((one @ one) * (two @ two)), 1e-300)
+        told = 2.0 * together / (1.0 + together) if together > 0.0 else 0.0
+        if told > LEAST_TOLD:  # What noise of the column hides is no other effort.
+            share = min(share / told, 1.0)
+        else:
+            one = two = own
+    parts = [np.array_split(x, PARTS) for x in (one, two, alone)]
+    each = [_slope(*part) for part in zip(*parts, strict=True)]
     std = float(np.std(each)) / np.sqrt(PARTS)
-    return Likeness(float(c[0]) / size, std / size, share)
+    return Likeness(_slope(one, two, alone) / size, std / size, share)
+
+
+def _without(rest, y):
+    """y (m,) without what rest (m, k) tells of it."""
+    return y - rest @ np.linalg.lstsq(rest, y, rcond=1e-9)[0]
+
+
+def _slope(one, two, y) -> float:
+    """Of y over what one and two, of noise of their own, both measure."""
+    return float((one + two) @ y / max(abs(2.0 * one @ two), 1e-300))
+
+
+class TooShort(ValueError):
+    """A log of less than a second, or of a few rows."""
 
 
 class Contents:
@@ -143,24 +175,32 @@ class Contents:
             ServoLog(self._time, self._q[:, list(order)], self._q)
         ) if len(self._time) > 20 else None  # fmt: skip
         if averaged is None:
-            raise ValueError("the log is too short")
+            raise TooShort("too short to tell what columns are by what is in them")
         self._even, _, _, self._kernels, states = averaged
         self._some = slice(None, None, max(len(states[0]) // MOST_SAMPLES, 1))
         self.q, self.v, self.vd = (x[self._some] for x in states)
         self.needed = needed_efforts(self._plant, self.q, self.v, self.vd)
+        context = self._plant.CreateDefaultContext()
+        self.weight = np.empty_like(self.needed)
+        for k, q in enumerate(self.q):
+            self._plant.SetPositions(context, q)
+            self.weight[k] = -self._plant.CalcGravityGeneralizedForces(context)
 
     def moves(self, i: int) -> bool:
         """Whether a joint does, by more than its position's grid or noise."""
         return float(np.ptp(self.q[:, i])) > 1e-3
 
-    def column(self, name: str) -> np.ndarray | None:
-        """(m,) averaged as the motion is; None where it has too few samples."""
+    def column(self, name: str, half: int | None = None) -> np.ndarray | None:
+        """(m,) averaged as the motion is; None where it has too few samples. half: 0 or
+        1: of every other sample alone."""
         y = self._columns[name]
         inside = np.zeros(len(y), bool)
         inside[self._rows[0] : self._rows[-1] + 1] = True
         there = np.isfinite(y) & inside & np.isfinite(self._all_time)
         if there.sum() < 20:
             return None
+        if half is not None:
+            there = np.flatnonzero(there)[half::2]
         even = np.interp(self._even, self._all_time[there], y[there])
         return np.convolve(even, self._kernels[0], "valid")[self._some]
 
@@ -175,7 +215,30 @@ class Contents:
         if y is None:
             return None
         rest = [np.ones_like(v), v, np.sign(v), *([self.vd[:, i]] if rotor else [])]
-        return likeness(self.needed[:, i], y, np.stack(rest, axis=1))
+        halves = [self.column(name, half) for half in (0, 1)]
+        return likeness(self.needed[:, i], y, np.stack(rest, axis=1), halves)
+
+    def lacks_weight(self, name: str, i: int) -> bool | None:
+        """Whether an effort has what the motion needs and not what the weight does;
+        None where the two look alike, or it does not go with them."""
+        y, v, weight = self.column(name), self.v[:, i], self.weight[:, i]
+        if y is None or np.std(weight) < WEIGHS * np.std(self.needed[:, i]):
+            return None
+        rest = np.stack([np.ones_like(v), v, np.sign(v)], axis=1)
+        X = np.column_stack([self.needed[:, i] - weight, weight, rest])
+        left = y - X @ np.linalg.lstsq(X, y, rcond=1e-9)[0]
+        alone = y - rest @ np.linalg.lstsq(rest, y, rcond=1e-9)[0]
+        if not left @ left < (1.0 - EXPLAINS) * float(alone @ alone):
+            return None
+        each = [
+            np.linalg.lstsq(A, b, rcond=1e-9)[0][:2]
+            for A, b in zip(
+                np.array_split(X, PARTS), np.array_split(y, PARTS), strict=True
+            )
+        ]
+        motion, weighs = np.mean(each, axis=0)
+        std = np.std([b / motion for _, b in each]) / np.sqrt(PARTS)
+        return bool(abs(weighs / motion) < LEFT_OUT) if std < KNOWN_TO else None
 
 
 def _si(columns, match: Match) -> np.ndarray:
@@ -195,8 +258,12 @@ def by_content(
     matches = _within_limits(joints, columns, matches, said)
     try:
         contents = Contents(plant, joints, columns, matches)
+    except TooShort as error:
+        said.append(Said("too_short", "time", 0.0, f"The log is {error}."))
+        return matches, said
     except ValueError:
         return matches, said
+    _without_weight(contents, matches, said)
     matches = _rightly_ordered(contents, matches, said)
     matches = _drives_that_drive(contents, matches, said)
     return _with_factors(contents, matches, said), said
@@ -260,6 +327,37 @@ def _within_limits(joints, columns, matches: Sequence[Match], said) -> list[Matc
     return out
 
 
+# ----- Without gravity
+
+
+def _without_weight(contents: Contents, matches, said) -> None:
+    """Of efforts that a controller adds the robot's weight to, the others are judged as
+    such: the motion then needs no more."""
+    names = [j.name for j in contents.joints]
+    lacks = {}
+    for m in matches:
+        at, _, what = (m.channel or "").rpartition(".")
+        if what in _DRIVES and at in names and contents.moves(names.index(at)):
+            lacks[m.column, at] = contents.lacks_weight(m.column, names.index(at))
+    told = [x for x in lacks.values() if x is not None]
+    if not told or not all(told):
+        return
+    efforts = _columns_of(contents, matches, _DRIVES)
+    n, with_weight = len(names), contents.needed
+    best = _assigned(_left(efforts, contents.of_effort, n), efforts)[1]
+    contents.needed = with_weight - contents.weight
+    if _assigned(_left(efforts, contents.of_effort, n), efforts)[1] > best:
+        contents.needed = with_weight  # Swapped columns may look like it.
+        return
+    column, at = next(key for key, x in lacks.items() if x)
+    says = (
+        f"{column} has what the motion of {at} needs, and nothing of the weight: as "
+        "what a controller commands that carries the robot's weight by itself. A scene "
+        "without gravity (plant: {gravity: [0, 0, 0]}) goes with it."
+    )
+    said.append(Said(WITHOUT_WEIGHT, at, 0.0, says))
+
+
 # ----- Whose column it is
 
 
@@ -306,22 +404,36 @@ def _order(columns: Mapping[int, str], relation, n: int) -> list[int] | None:
     clear that they are wrong."""
     if len(columns) < 2:
         return None
-    left = np.full((n, n), 1.0)  # Of joint i by the column of joint k.
-    for k, name in columns.items():
-        for i in columns:
-            found = relation(name, i)
-            left[i, k] = 1.0 if found is None else 1.0 - found.explained
-    there = list(columns)
-    cost = np.log(np.maximum(left, 1e-3))[np.ix_(there, there)]
-    order = list(range(n))
-    for i, k in zip(*linear_sum_assignment(cost), strict=True):
-        order[there[i]] = there[k]
+    left = _left(columns, relation, n)
+    order, _ = _assigned(left, columns)
     wrong = [i for i in range(n) if order[i] != i]
     clear = all(
         left[i, order[i]] < 1.0 - EXPLAINS and left[i, i] > CLEARER * left[i, order[i]]
         for i in wrong
     )
     return order if wrong and clear else None
+
+
+def _left(columns: Mapping[int, str], relation, n: int) -> np.ndarray:
+    """(n, n) share that the column of joint k leaves of joint i."""
+    left = np.full((n, n), 1.0)
+    for k, name in columns.items():
+        for i in columns:
+            found = relation(name, i)
+            left[i, k] = 1.0 if found is None else 1.0 - found.explained
+    return left
+
+
+def _assigned(left: np.ndarray, columns: Mapping[int, str]) -> tuple[list[int], float]:
+    """(n,) whose column fits each joint best; the mean logarithm of what is left."""
+    there, order = list(columns), list(range(len(left)))
+    if not there:
+        return order, 0.0
+    cost = np.log(np.maximum(left, 1e-3))[np.ix_(there, there)]
+    rows, cols = linear_sum_assignment(cost)
+    for i, k in zip(rows, cols, strict=True):
+        order[there[i]] = there[k]
+    return order, float(cost[rows, cols].mean())
 
 
 def _reordered(contents, matches, quantities, order: Sequence[int], said):
@@ -440,8 +552,12 @@ def _factors(
     odd = {i: f for i, f in sure.items() if not GAINS[0] < f < GAINS[1]}
     if not odd:
         return {}
-    middle = float(np.median(list(odd.values())))
-    alike = all(abs(f / middle - 1.0) < ALIKE for f in sure.values())
+    stds = np.array([max(found[i][1].std, 1e-3 * abs(f)) for i, f in sure.items()])
+    each = np.array(list(sure.values()))
+    middle = float(np.average(each, weights=stds**-2.0))
+    within = float(max(ALIKE / 6.0 * abs(middle), np.sum(stds**-2.0) ** -0.5))
+    alike = bool((np.abs(each - middle) < np.maximum(ALIKE * abs(middle),
+                                                     SIGMAS * stds)).all())  # fmt: skip
     alike &= len(sure) > 1 or abs(middle) > 1.0
     if not alike:  # Loads and springs make some efforts larger, or smaller.
         odd = {i: f for i, f in odd.items()
@@ -450,7 +566,7 @@ def _factors(
         odd = dict.fromkeys(found, middle)
     out = {}
     for i, factor in odd.items():
-        std = found[i][1].std if not alike else ALIKE / 6.0 * abs(factor)
+        std = found[i][1].std if not alike else within
         out[i] = _in_words(factor, std)
     return out
 
@@ -524,14 +640,13 @@ def check_contents(
         matches = [Match(name, name) for name in columns]
         _, said = by_content(plant, joints, columns, matches)
         for each in said:
-            wrong = each.kind != "no_content"
             says = each.says
             if each.kind == "effort_factor":
                 says += (
                     f" In the sidecar: columns: {{NAME: {{channel: {each.channel}, "
                     f"scale: {each.size:.6g}}}}}"
                 )
-            severity = "error" if wrong else "warning"
+            severity = _SEVERITY.get(each.kind, "error")
             found.append(
                 Finding(each.kind, r.name, each.channel, each.size, "", severity, says)
             )

@@ -15,7 +15,13 @@ from pydrake.multibody.tree import ModelInstanceIndex
 
 from makebreak.gap.data.bags import MotorRange, is_dataset, motor_ranges
 from makebreak.gap.data.base_pose import BasePose, base_pose
-from makebreak.gap.data.content import Contents, Said, by_content, told_by
+from makebreak.gap.data.content import (
+    WITHOUT_WEIGHT,
+    Contents,
+    Said,
+    by_content,
+    told_by,
+)
 from makebreak.gap.data.findings import (
     FIXED,
     GUESSED_GAINS,
@@ -476,6 +482,8 @@ def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
     if actuation == NO_ACTUATION:
         _check_currents(every, robot, logs)
     gravity = list(robot.file.gravity)
+    if any(each.kind == WITHOUT_WEIGHT for each in judged.said):
+        gravity = [0.0, 0.0, 0.0]
     own = "" if gravity == [0.0, 0.0, -9.81] else f", gravity: {gravity}"
     lines += [f"plant: {{time_step: 0.001{own}}}", *actuation]
     lines += _effects_of_file(robot, fixed, lines)
