@@ -18,6 +18,8 @@ from pathlib import Path
 
 import numpy as np
 from pydrake.multibody.tree import MultibodyForces
+from scipy.io import savemat
+from scipy.spatial.transform import Rotation
 
 from makebreak.gap.data.checks import check_recordings
 from makebreak.gap.data.content import check_contents
@@ -41,7 +43,17 @@ ROBOTS = {
             ("revolute", "0 1 0", 3.1), ("revolute", "0 1 0", 3.1),
             ("revolute", "1 0 0", 3.1), ("revolute", "0 1 0", 3.1)],
     "cart": [("prismatic", "1 0 0", 0.8), ("revolute", "0 1 0", 3.1)],
+    "scara": [("revolute", "0 0 1", 2.8), ("revolute", "0 0 1", 2.6),
+              ("prismatic", "0 0 1", 0.7), ("revolute", "0 0 1", 3.1)],
+    "gantry": [("prismatic", "1 0 0", 1.2), ("prismatic", "0 1 0", 0.9),
+               ("prismatic", "0 0 1", 0.7)],
+    "hand": [("revolute", "0 1 0", 2.5), ("revolute", "0 1 0", 2.6),
+             ("revolute", "1 0 0", 2.5), ("revolute", "1 0 0", 2.6)],
+    "wrist6": [("revolute", "0 0 1", 6.2), ("revolute", "0 1 0", 2.1),
+               ("revolute", "0 1 0", 3.9), ("revolute", "1 0 0", 6.2),
+               ("revolute", "0 1 0", 3.1), ("revolute", "1 0 0", 6.2)],
 }  # fmt: skip
+PARENTS = {"hand": {3: "base"}}  # Where a link does not hang from the one before.
 
 
 def urdf(name: str, rng) -> str:
@@ -51,7 +63,8 @@ def urdf(name: str, rng) -> str:
         links.append(
             LINK.format(
                 k=k, c=-0.12, m=m, i=m * 0.012, z=m * 0.003, name=f"joint{k}",
-                type=kind, parent="base" if k == 1 else f"l{k - 1}",
+                type=kind,
+                parent=PARENTS.get(name, {}).get(k, f"l{k - 1}" if k > 1 else "base"),
                 z0=-0.3 if k > 1 else 0.5, axis=axis, low=-limit, high=limit,
             )
         )  # fmt: skip
@@ -152,7 +165,8 @@ def without_weight(log: Log):
     for k, name in enumerate(names(log, "effort")):
         log.columns[name] = log.columns[name] - log.weight[:, k]
         log.truth[f"arm.joint{k + 1}.effort_measured"] -= log.weight[:, k]
-    return ("gravity: [0.0, 0.0, 0.0]",)
+    # A weight that is always the same looks like a bias.
+    return ("gravity: [0.0, 0.0, 0.0]" if np.ptp(log.weight, axis=0).any() else "",)
 
 
 def signs(log: Log):
@@ -266,7 +280,7 @@ def rates(factor, *words):
         for i, name in enumerate(names(log, "velocity")):
             if not log.slides[i]:
                 log.columns[name] = log.columns[name] * factor
-        return words
+        return words if not all(log.slides) else ("",)
 
     return wrong
 
@@ -352,6 +366,146 @@ def noisy_column(name, value, *words):
     return wrong
 
 
+def as_npz(log: Log):
+    """As Isaac Lab and PACE have it: arrays of rows, dt, joints' names."""
+
+    def write(folder: Path, columns: dict) -> Path:
+        path = folder / "log.npz"
+        arrays = {
+            array: np.stack([columns[n] for n in names(log, what)], axis=1)
+            for array, what in (("dof_pos", "position"), ("dof_vel", "velocity"),
+                                ("applied_torque", "effort"))
+        }  # fmt: skip
+        named = np.array([f"joint{i + 1}" for i in range(log.joints)])
+        np.savez(path, **arrays, dof_names=named, step_dt=1.0 / RATE, env="lab")
+        return path
+
+    log.write = write
+    return ("dt",)
+
+
+def as_mat(log: Log):
+    def write(folder: Path, columns: dict) -> Path:
+        path = folder / "log.mat"
+        savemat(path, {"meas": {
+            "t": log.time, **{key: np.stack([columns[n] for n in names(log, what)])
+                              for key, what in (("q", "position"), ("dq", "velocity"),
+                                                ("tau", "effort"))},
+        }})  # fmt: skip
+        return path
+
+    log.write = write
+    return ("",)
+
+
+def text_file(separator, above="", below="", missing="", every=0, suffix=".csv"):
+    """A table as other programs write it."""
+
+    def wrong(log: Log):
+        def write(folder: Path, columns: dict) -> Path:
+            path = folder / f"log{suffix}"
+            rows = []
+            for k, row in enumerate(zip(*columns.values(), strict=True)):
+                cells = [f"{x:.9g}" for x in row]
+                if every and k % every == 5:
+                    cells[-1] = missing
+                rows.append(separator.join(cells))
+            head = [above, separator.join(columns)]
+            if below:
+                unit = {"position": "rad", "velocity": "rad/s", "effort": "Nm"}
+                head.append(separator.join(
+                    ["s", *(unit[name.split("_")[1]] for name in list(columns)[1:])]
+                ))  # fmt: skip
+            path.write_text("\n".join([*filter(None, head), *rows]) + "\n")
+            return path
+
+        log.columns = {"time": log.time} | log.columns
+        log.write = write
+        if every:
+            log.truth.pop(f"arm.joint{log.joints}.effort_measured")
+        return ("",)
+
+    return wrong
+
+
+def rows_in(order, *words):
+    """Rows in another order, or with other stamps: order(log) gives rows and times."""
+
+    def wrong(log: Log):
+        rows, time = order(log)
+        log.columns = {"time": time[rows]} | {
+            n: y[rows] for n, y in log.columns.items()
+        }
+        return words
+
+    return wrong
+
+
+def restarted(log: Log):
+    half = len(log.time) // 2
+    t = np.where(np.arange(len(log.time)) < half, log.time, log.time - log.time[half])
+    log.columns = {"time": t} | log.columns
+    log.truth = {}
+    return ("starts again",)
+
+
+def shuffled(log: Log):
+    rows = np.arange(len(log.time))
+    for k in range(100, 1000, 40):
+        rows[k : k + 6] = log.rng.permutation(rows[k : k + 6])
+    return rows, log.time
+
+
+def cycled(what):
+    """Columns of three joints in another order."""
+
+    def wrong(log: Log):
+        mine = names(log, what)
+        if len(mine) < 3:
+            return swapped(what)(log)
+        a, b, c = mine[0], mine[1], mine[2]
+        cols = log.columns
+        cols[a], cols[b], cols[c] = cols[c], cols[a], cols[b]
+        return ("another order", "one off", "swapped")
+
+    return wrong
+
+
+def position_sign(log: Log):
+    """An encoder that counts the other way, while the velocity is right."""
+    name = names(log, "position")[0]
+    log.columns[name] = -log.columns[name]
+    return ("other sign",)
+
+
+def in_turns(log: Log):
+    for i in range(log.joints):
+        if not log.slides[i]:
+            for what in ("position", "velocity"):
+                log.columns[f"joint{i + 1}_{what}"] /= 2.0 * np.pi
+    return ("turns", "revolutions") if not all(log.slides) else ("",)
+
+
+def hung(log: Log):
+    """An IMU of the base, which stands level."""
+    n = len(log.time)
+    off = Rotation.from_rotvec(log.rng.normal(0.0, 1e-3, (n, 3))).as_quat()
+    own = {f"imu_orientation_{k}": off[:, i] for i, k in enumerate("xyzw")}
+    log.columns |= own
+    return ("at the pose that the log has",)
+
+
+def lost_rows(log: Log):
+    kept = np.flatnonzero(log.rng.random(len(log.time)) > 0.15)
+    return kept, log.time
+
+
+def sign_and_gear(log: Log):
+    for name in names(log, "effort"):
+        log.columns[name] = log.columns[name] / -64.0
+    return ("in another unit, and of the other sign",)
+
+
 def missing_effort(log: Log):
     name = names(log, "effort")[-1]
     del log.columns[name]
@@ -430,7 +584,41 @@ KINDS = {
     "a stamp that steps back": back,
     "rows twice": twice,
     "semicolons and commas": semicolons,
-}
+    # Written before anything was seen of them, for robots that are not above either.
+    "npz with names and dt": as_npz,
+    "mat with a struct": as_mat,
+    "blanks and comments": text_file("  ", "# rig 2\n# run 7", suffix=".txt"),
+    "tabs": text_file("\t", suffix=".tsv"),
+    "a row of units": text_file(",", below="units"),
+    "lines above the header": text_file(",", "Robot: rig 2\nDate: Friday"),
+    "missing cells as N/A": text_file(",", missing="N/A", every=40),
+    "missing cells as null": text_file(",", missing="null", every=40),
+    "missing cells as -": text_file(";", missing="-", every=40),
+    "time starts again": restarted,
+    "rows shuffled": rows_in(shuffled, "order of their stamps"),
+    "rows lost": rows_in(lost_rows, ""),
+    "a stamp far ahead": rows_in(
+        lambda log: (np.arange(len(log.time)),
+                     np.where(np.arange(len(log.time)) == 300, 1e6, log.time)),
+        "step back",
+    ),
+    "coarse stamps": rows_in(
+        lambda log: (np.arange(len(log.time)), np.floor(log.time * 25.0) / 25.0),
+        "coarser",
+    ),
+    "time in ticks of 0.1 ms": stamps(lambda log: np.rint(1e4 * log.time), "time"),
+    "time in minutes": stamps(lambda log: log.time / 60.0, "min", key="t_min"),
+    "efforts in another order": cycled("effort"),
+    "positions in another order": cycled("position"),
+    "one position of other sign": position_sign,
+    "positions in turns": in_turns,
+    "effort in lbf in": scaled("effort", 0.112985, "lbf in"),
+    "effort of other sign before a gear": sign_and_gear,
+    "torque limits first": noisy_column("joint{}_torque_limit", 80.0, "torque_limit"),
+    "velocity error first": decoy("joint{}_velocity_error", noise, "velocity_error"),
+    "an IMU on the base": hung,
+}  # fmt: skip
+UNSEEN = list(KINDS)[list(KINDS).index("npz with names and dt") :]
 
 
 @dataclass(frozen=True)
@@ -516,9 +704,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--count", type=int, default=120)
+    parser.add_argument("--unseen", action="store_true", help="the later kinds alone")
     args = parser.parse_args()
     rng = np.random.default_rng(args.seed)
-    kinds = list(KINDS)
+    kinds = UNSEEN if args.unseen else list(KINDS)
     good, n = [0, 0], 0
     for k in range(args.count):
         kind = kinds[k % len(kinds)]

@@ -281,3 +281,32 @@ def test_dates_are_read_as_seconds(tmp_path, stamp, zone):
     np.testing.assert_allclose(
         table.columns["when"], 1795816800.25 + np.arange(9), atol=1e-6
     )
+
+
+ABOVE = "Robot: rig 2\nRate; 100\n\n"
+
+
+@pytest.mark.parametrize(
+    "head, names",
+    [
+        (ABOVE + "time;q1;q2\n", ["time", "q1", "q2"]),
+        ("time;q1;q2\ns;deg;rad\n", ["time [s]", "q1 [deg]", "q2 [rad]"]),
+        (ABOVE + "time;q1;q2\ns;[\u00b0];-\n", ["time [s]", "q1 [\u00b0]", "q2"]),
+        ("% made by hand\n% time; q1; q2\n", ["time", "q1", "q2"]),
+        (ABOVE, []),
+    ],
+)
+@pytest.mark.parametrize("encoding", ["utf-8", "cp1252"])
+def test_names_are_above_the_first_row_of_numbers(tmp_path, head, names, encoding):
+    """Whatever a program writes above them, and with units below them."""
+    rows = "".join(f"{t:.4f};{q:.6f};n/a\n" for t, q in zip(T, Q, strict=True))
+    path = tmp_path / "a.csv"
+    path.write_bytes((head + rows).encode(encoding))
+    if head == ABOVE:  # Names of another number of cells: rows say so.
+        with pytest.raises(ValueError, match="row 1 has 3 cells, expected 2"):
+            read_table(path)
+        return
+    columns = read_table(path).columns
+    assert list(columns) == names
+    np.testing.assert_array_equal(columns[names[1]], Q)
+    assert np.isnan(columns[names[2]]).all()

@@ -21,7 +21,13 @@ from pydrake.multibody.plant import MultibodyPlant
 from scipy.optimize import linear_sum_assignment
 
 from makebreak.gap.data.findings import Finding
-from makebreak.gap.data.proposal import AS_SAID, CURRENT, JointName, Match
+from makebreak.gap.data.proposal import (
+    AS_SAID,
+    BY_DERIVATIVE,
+    CURRENT,
+    JointName,
+    Match,
+)
 from makebreak.gap.data.recording import Recording
 from makebreak.gap.data.servo_gains import (
     ServoLog,
@@ -35,6 +41,7 @@ MOST_SAMPLES = 1000  # At which inverse dynamics is computed.
 MOST_SEC = 60.0  # Of a log that is looked at.
 EXPLAINS, NOTHING = 0.9, 0.5  # Shares of what is predicted: is told by it, is not.
 CLEARER = 5.0  # Times less is left by another joint's column than by its own.
+TOLD_WELL = 0.01  # Of what is predicted: no other unit can tell it much better.
 LEAST_TOLD = 0.3  # Of a column that is not noise, to judge it without that.
 PARTS = 5  # Of the data: a factor scatters over them.
 KNOWN_TO = 0.1  # Of a factor, 1 sigma.
@@ -58,6 +65,9 @@ _UNITS = (
     (9.80665, "as if in kgf m"), (0.112985, "as if in lbf in"),
     (1.355818, "as if in lbf ft"),
 )  # fmt: skip
+
+
+_TIMES = (*(10.0**k for k in range(-6, 7)), 60.0, 3600.0)
 
 
 @dataclass(frozen=True)
@@ -167,6 +177,10 @@ class Contents:
         self._all_time = time
         self.moved(range(len(joints)), q)
 
+    def at_times(self, matches: Sequence[Match]) -> "Contents":
+        """The same with another unit of time."""
+        return Contents(self._plant, self.joints, self._columns, matches)
+
     def moved(self, order: Sequence[int], q: np.ndarray | None = None) -> None:
         """With the positions (n, n_q), or those of before in another order."""
         if q is not None:
@@ -185,6 +199,11 @@ class Contents:
         for k, q in enumerate(self.q):
             self._plant.SetPositions(context, q)
             self.weight[k] = -self._plant.CalcGravityGeneralizedForces(context)
+
+    def scaled(self, joints: Sequence[int], factor: float) -> None:
+        """With the positions of these joints times a factor."""
+        self._q[:, list(joints)] *= factor
+        self.moved(range(self._q.shape[1]))
 
     def moves(self, i: int) -> bool:
         """Whether a joint does, by more than its position's grid or noise."""
@@ -263,9 +282,12 @@ def by_content(
         return matches, said
     except ValueError:
         return matches, said
+    matches, contents = _rightly_timed(contents, matches, said)
+    matches = _rightly_signed(contents, matches, said)
     _without_weight(contents, matches, said)
     matches = _rightly_ordered(contents, matches, said)
     matches = _drives_that_drive(contents, matches, said)
+    matches = _in_turns(contents, matches, said)
     return _with_factors(contents, matches, said), said
 
 
@@ -324,6 +346,126 @@ def _within_limits(joints, columns, matches: Sequence[Match], said) -> list[Matc
                 why = f"{m.why}; {-turn / TURN:+.0f} turn, by the joint's limits"
                 m = replace(m, offset=float(m.offset - turn), why=why)
         out.append(m)
+    return out
+
+
+# ----- What positions and times are counted in
+
+
+def _speed_factors(contents: Contents, matches) -> dict[int, float]:
+    """{joint: rate of its position over its velocity column, as that is taken; but as
+    it is where only its motion told its unit}."""
+    number = {j.name: i for i, j in enumerate(contents.joints)}
+    found = {}
+    for m in matches:
+        at, _, what = (m.channel or "").rpartition(".")
+        if what == "velocity" and at in number:
+            x = contents.of_velocity(m.column, number[at])
+            if x is not None and x.explained > EXPLAINS and contents.moves(number[at]):
+                by_motion = m.why.endswith(BY_DERIVATIVE)
+                found[number[at]] = x.factor / (1.0 if by_motion else m.scale)
+    return found
+
+
+def _rightly_timed(contents: Contents, matches, said):
+    """With the unit of time that makes all positions' rates their velocities, where one
+    round number does, and no unit of velocity could."""
+    factors = np.array(list(_speed_factors(contents, matches).values()))
+    time = next(m for m in matches if m.channel == "time")
+    if len(factors) < 2 or time.why == AS_SAID:
+        return matches, contents
+    middle = float(np.median(factors))
+    round_to = min(_TIMES, key=lambda f: abs(np.log(max(middle, 1e-9) / f)))
+    if round_to == 1.0 or (np.abs(factors / round_to - 1.0) > ALIKE).any():
+        return matches, contents
+    scale = time.scale * round_to
+    says = (
+        f"Column {time.column} counts units of {scale:.6g} s: by it, positions change "
+        f"{1.0 / round_to:.6g} times as fast as all velocities say."
+    )
+    why = f"{time.why}; in units of {scale:.6g} s, by positions and velocities"
+    out = [
+        replace(m, scale=scale, why=why) if m is time
+        else replace(m, scale=1.0) if m.why.endswith(BY_DERIVATIVE) else m
+        for m in matches
+    ]  # fmt: skip
+    said.append(Said("time_unit", "time", round_to, says))
+    return out, contents.at_times(out)
+
+
+def _misfit(contents: Contents, efforts: Mapping[int, str]) -> float:
+    """Mean logarithm of the shares that efforts do not explain."""
+    each = [contents.of_effort(name, i) for i, name in efforts.items()]
+    left = [1.0 if x is None else 1.0 - x.explained for x in each]
+    return float(np.mean(np.log(np.maximum(left, 1e-3))))
+
+
+def _in_turns(contents: Contents, matches, said) -> list[Match]:
+    """Angles that are counted in turns, by the efforts: of what swings they go with
+    the sine. Half as much is then left of them, and the limits allow it."""
+    efforts = _columns_of(contents, matches, _DRIVES)
+    mine = _columns_of(contents, matches, ("position",))
+    group = [i for i in mine if not contents.joints[i].prismatic]
+    before = _misfit(contents, efforts) if efforts and group else -np.inf
+    if before < np.log(TOLD_WELL):
+        return matches
+    speeds = _speed_factors(contents, matches)
+    contents.scaled(group, TURN)
+    joints = [contents.joints[i] for i in group]
+    low, high = contents.q[:, group].min(axis=0), contents.q[:, group].max(axis=0)
+    room = np.array([0.1 * np.nan_to_num(j.upper - j.lower) for j in joints])
+    inside = np.all(low > [j.lower for j in joints] - room)
+    inside &= np.all(high < [j.upper for j in joints] + room)
+    after = _misfit(contents, efforts)
+    if not inside or after > min(np.log(1.0 - EXPLAINS), before - np.log(2.0)):
+        contents.scaled(group, 1.0 / TURN)
+        return matches
+    names = {j.name for j in joints}
+    alike = {contents.joints[i].name for i in group
+             if abs(speeds.get(i, 1.0) - 1.0) < KNOWN_TO}  # fmt: skip
+    out, moved = [], []
+    for m in matches:
+        at, _, what = (m.channel or "").rpartition(".")
+        here = "position" in what and at in names or what == "velocity" and at in alike
+        if m.why != AS_SAID and here:
+            why = f"{m.why}; in turns, by the efforts"
+            m = replace(m, scale=m.scale * TURN, offset=m.offset * TURN, why=why)
+            moved.append(m.column)
+        out.append(m)
+    says = f"By the efforts that go with them, {', '.join(moved)} are in turns."
+    said.append(Said("position_unit", joints[0].name, TURN, says))
+    return out
+
+
+def _rightly_signed(contents: Contents, matches, said) -> list[Match]:
+    """A position that contradicts both its velocity and its effort has the wrong sign,
+    and not these two."""
+    efforts, out = _columns_of(contents, matches, _DRIVES), list(matches)
+    for k, m in enumerate(matches):
+        at, _, what = (m.channel or "").rpartition(".")
+        i = next((i for i, j in enumerate(contents.joints) if j.name == at), None)
+        if what != "velocity" or m.scale > 0.0 or m.why == AS_SAID or i not in efforts:
+            continue
+        before, all_before = contents.of_effort(efforts[i], i), _fit(contents, efforts)
+        contents.scaled([i], -1.0)
+        after = contents.of_effort(efforts[i], i)
+        if (
+            before is None or after is None or not before.factor < 0.0 < after.factor
+            or after.explained < EXPLAINS or _fit(contents, efforts) < all_before - 0.05
+        ):  # fmt: skip
+            contents.scaled([i], -1.0)
+            continue
+        out[k] = replace(m, scale=-m.scale, why=f"{m.why}; no, its position is")
+        for n, other in enumerate(out):
+            if other.channel in (f"{at}.position", f"{at}.position_command"):
+                why = f"{other.why}; of the other sign than velocity and effort say"
+                out[n] = replace(
+                    other, scale=-other.scale, offset=-other.offset, why=why
+                )
+        says = (
+            f"The position of {at} is of the other sign than velocity and effort say."
+        )
+        said.append(Said("position_sign", f"{at}.position", -1.0, says))
     return out
 
 
@@ -544,21 +686,24 @@ def _factors(
 ) -> dict[int, tuple[float, str]]:
     """{joint: (what its effort is to be multiplied with, as what it looks)} where that
     is no gain of an actuator."""
-    sure = {
-        i: x.factor for i, (name, x) in found.items()
+    known = {
+        i: x for i, (_, x) in found.items()
         if x.explained > EXPLAINS and x.std < KNOWN_TO * abs(x.factor)
-        and (abs(x.factor) > GAINS[1] or _not_a_rotor(contents, name, i, x.factor))
     }  # fmt: skip
-    odd = {i: f for i, f in sure.items() if not GAINS[0] < f < GAINS[1]}
+    # One factor of all is no matter of their rotors.
+    middle, within = _one_factor(list(known.values()))
+    alike = within > 0.0 and len(known) > 1
+    if not alike:
+        known = {
+            i: x for i, x in known.items() if abs(x.factor) > GAINS[1]
+            or _not_a_rotor(contents, found[i][0], i, x.factor)
+        }  # fmt: skip
+        middle, within = _one_factor(list(known.values()))
+        alike = within > 0.0 and (len(known) > 1 or abs(middle) > 1.0)
+    odd = {i: x.factor for i, x in known.items()
+           if not GAINS[0] < x.factor < GAINS[1]}  # fmt: skip
     if not odd:
         return {}
-    stds = np.array([max(found[i][1].std, 1e-3 * abs(f)) for i, f in sure.items()])
-    each = np.array(list(sure.values()))
-    middle = float(np.average(each, weights=stds**-2.0))
-    within = float(max(ALIKE / 6.0 * abs(middle), np.sum(stds**-2.0) ** -0.5))
-    alike = bool((np.abs(each - middle) < np.maximum(ALIKE * abs(middle),
-                                                     SIGMAS * stds)).all())  # fmt: skip
-    alike &= len(sure) > 1 or abs(middle) > 1.0
     if not alike:  # Loads and springs make some efforts larger, or smaller.
         odd = {i: f for i, f in odd.items()
                if f < 0.0 or not 1.0 / LARGE < f < LARGER}  # fmt: skip
@@ -569,6 +714,18 @@ def _factors(
         std = found[i][1].std if not alike else within
         out[i] = _in_words(factor, std)
     return out
+
+
+def _one_factor(each: Sequence[Likeness]) -> tuple[float, float]:
+    """The factor that all are, and its standard deviation; 0 where they differ."""
+    if not each:
+        return 0.0, 0.0
+    factors = np.array([x.factor for x in each])
+    stds = np.maximum([x.std for x in each], 1e-3 * np.abs(factors))
+    middle = float(np.average(factors, weights=stds**-2.0))
+    within = float(max(ALIKE / 6.0 * abs(middle), np.sum(stds**-2.0) ** -0.5))
+    room = np.maximum(ALIKE * abs(middle), SIGMAS * stds)
+    return middle, within if (np.abs(factors - middle) < room).all() else 0.0
 
 
 def _not_a_rotor(contents: Contents, name: str, i: int, factor: float) -> bool:

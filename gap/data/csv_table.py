@@ -16,6 +16,11 @@ import numpy as np
 
 _BLOCK = 1 << 23  # [bytes] of text that are parsed at a time.
 NAMELESS = "column_"  # What columns without a name are called, with their number.
+_HEAD = 60  # Lines among which names are looked for.
+# A cell without a number, as programs write it.
+_MISSING = re.compile(
+    rb"(?i)(?<![^,\n])\s*(n/?a|null|none|missing|#n/?a|-+|\?)\s*(?![^,\n])"
+)
 _SHOWN = 3  # Bad rows that are named one by one.
 _QUOTED = re.compile(rb'"([^"\n]*)"')
 # ISO 8601, as data frames and loggers write it.
@@ -29,7 +34,8 @@ class Dialect:
     """How a csv file is written. names: of its columns; lists: {column: how many
     numbers its cells hold}, of cells as [1, 2, 3]; unused: columns that may hold
     anything; headless: the first line is a row, and the names are column_1, ...;
-    stamped: some cells are dates with times, which become seconds since 1970."""
+    stamped: some cells are dates with times, which become seconds since 1970; holey:
+    some cells say in a word that nothing is there."""
 
     separator: str
     decimal_comma: bool
@@ -39,6 +45,7 @@ class Dialect:
     unused: frozenset[str] = frozenset()
     headless: bool = False
     stamped: bool = False
+    holey: bool = False
 
     def columns(self) -> list[str]:
         """Names of the columns of numbers: a list's are name[0], name[1], ..."""
@@ -102,20 +109,76 @@ def size_of(path: Path) -> int:
 
 def header_of(file) -> bytes:
     """The line of names, else the first row, of an open file that then stands below
-    it. Lines above it that begin with # or % are comments; the last of them has the
-    names where nothing else can (as numpy and MATLAB write them)."""
-    comment, start = b"", 0
-    while True:
-        line = file.readline()
-        if line[:1] not in (b"#", b"%") and (line.strip() or not line):
-            break
-        if line.strip():
-            comment, start = line[1:], file.tell()
-    names, row = (re.split(rb"[,;\t ]+", x.strip()) for x in (comment, line))
-    if comment and len(names) == len(row) and re.fullmatch(rb"[-+.\d].*|nan", row[0]):
-        file.seek(start)
-        return comment
-    return line
+    it. Names are above the first row of numbers and have as many cells: comments (#,
+    %) and what else a program writes above them are no names, a second line of texts
+    is their units."""
+    lines: list[tuple[bytes, int]] = []  # With where each ends.
+    while len(lines) < _HEAD and (line := file.readline()):
+        lines.append((line, file.tell()))
+    shown = [x for x in lines if x[0].strip()]
+    if not shown:
+        return lines[-1][0] if lines else b""
+    last = _decoded(shown[-2 if len(shown) > 3 else -1][0])
+    separator = next((x for x in ";\t," if x in last), " ")
+    tables = [_split(line.lstrip(b"#% "), separator) for line, _ in shown]
+    comment = [line[:1] in (b"#", b"%") for line, _ in shown]
+    n = len(tables[-2 if len(shown) > 3 else -1])
+    row = next(
+        (k for k, cells in enumerate(tables)
+         if not comment[k] and len(cells) == n and _has_numbers(cells)),
+        None,
+    )  # fmt: skip
+    plain = [k for k in range(len(shown)) if not comment[k]]
+    if row is None:  # Texts only, or nothing: said where rows are read.
+        k = plain[0] if plain else len(shown) - 1
+        file.seek(shown[k][1])
+        return shown[k][0]
+    names = [k for k in range(row) if len(tables[k]) == n]
+    own = [k for k in names if not comment[k]] or names[-1:]
+    above = [k for k in plain if k < row]
+    if not own and not above:
+        file.seek(shown[row][1])
+        return shown[row][0]
+    if not own:  # Of another number of cells: rows say so.
+        file.seek(shown[above[-1]][1])
+        return shown[above[-1]][0]
+    file.seek(shown[row - 1][1])
+    header = shown[own[0]][0].lstrip(b"#% " if comment[own[0]] else b"")
+    if len(own) == 1:
+        return header
+    file.seek(shown[own[-1]][1])
+    with_units = [
+        name if not unit.strip("- ") or unit in name or name.count(".") > 1
+        else f"{name} [{unit.strip('[]() ')}]"
+        for name, unit in zip(tables[own[0]], tables[own[1]], strict=True)
+    ]  # fmt: skip
+    return (separator.join(with_units) + "\n").encode()
+
+
+def _split(line: bytes, separator: str) -> list[str]:
+    text = _decoded(_in_seconds(line)).strip()
+    if separator == " ":
+        return text.split()
+    return [x.strip() for x in next(csv.reader([text], delimiter=separator), [])]
+
+
+def _has_numbers(cells: Sequence[str]) -> bool:
+    for cell in cells:
+        try:
+            float(cell.replace(",", "."))
+        except ValueError:
+            if _list(cell) is None:
+                continue
+        return True
+    return False
+
+
+def _decoded(text: bytes) -> str:
+    """Text in UTF-8, or as Windows has it in western Europe."""
+    try:
+        return text.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return text.decode("cp1252", errors="replace")
 
 
 def dialect_of(
@@ -126,10 +189,9 @@ def dialect_of(
     Args: unused: columns that nobody needs, whatever they hold.
     Raises: ValueError for what is no text, or has a column twice.
     """
-    try:
-        text = _in_seconds(header).decode("utf-8-sig").strip()
-    except UnicodeDecodeError:
-        raise ValueError(f"recording {path} is no text: expected a csv table") from None
+    if b"\0" in header + sample:
+        raise ValueError(f"recording {path} is no text: expected a csv table")
+    text = _decoded(_in_seconds(header)).strip()
     plain = re.sub(r'"[^"]*"', "", text)
     separator = max(",;\t", key=plain.count)
     if not plain.count(separator):
@@ -166,8 +228,9 @@ def dialect_of(
     comma |= separator == "," and re.search(r'"-?\d+,\d+"', body) is not None
     unused = unused & set(names)
     return Dialect(
-        separator, comma, '"' in body, tuple(names), lists, unused, headless, stamped
-    )
+        separator, comma, '"' in body, tuple(names), lists, unused, headless, stamped,
+        _MISSING.search(sample.replace(separator.encode(), b",")) is not None,
+    )  # fmt: skip
 
 
 def _in_seconds(text: bytes) -> bytes:
@@ -261,6 +324,7 @@ def parse(
     filled = filled.replace(b",\n", b",nan\n").replace(b"\n,", b"\nnan,")
     if filled.startswith(b","):
         filled = b"nan" + filled
+    filled = _MISSING.sub(b"nan", filled) if dialect.holey else filled
     try:
         use = [i for i, name in enumerate(dialect.names) if name not in dialect.unused]
         if len(use) < len(dialect.names):  # It looks at no other cell of a row.
@@ -333,6 +397,8 @@ def _numbers(dialect: Dialect, name: str, cell: str) -> tuple[list[float], str]:
         return found, ""
     if dialect.decimal_comma:
         cell = cell.replace(",", ".")
+    if _MISSING.fullmatch(cell.encode()):
+        return [np.nan], ""
     try:
         value = float(cell) if cell else np.nan
         if abs(value) != np.inf:

@@ -22,6 +22,7 @@ IN_DEGREES = "in degrees, by its name or its size"
 FULL_RANGE = 100.5  # Per cent, from one end of a joint's range, or from its middle.
 # Times its limit that a joint would be at, were it in degrees.
 _BEYOND = 1.25
+BY_DERIVATIVE = "against the position's derivative"
 AS_SAID = "as the recording's sidecar says"
 _COMMAND = set(
     "cmd command commands commanded target desired des ref reference goal goals "
@@ -715,7 +716,7 @@ def _rate_scale(columns, time: Match, position: Match | None, name: str):
     unit, factor = rate
     if ratio < 0.0:
         return -factor, "of the other sign than the position's derivative"
-    return factor, f"in {unit}, against the position's derivative"
+    return factor, f"in {unit}, {BY_DERIVATIVE}"
 
 
 def _rate_of(ratio: float) -> tuple[str, float] | None:
