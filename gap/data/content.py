@@ -42,6 +42,7 @@ MOST_SEC = 60.0  # Of a log that is looked at.
 EXPLAINS, NOTHING = 0.9, 0.5  # Shares of what is predicted: is told by it, is not.
 CLEARER = 5.0  # Times less is left by another joint's column than by its own.
 TOLD_WELL = 0.01  # Of what is predicted: no other unit can tell it much better.
+GIVES_WAY = 0.05  # [rad], [m]
 LEAST_TOLD = 0.3  # Of a column that is not noise, to judge it without that.
 PARTS = 5  # Of the data: a factor scatters over them.
 KNOWN_TO = 0.1  # Of a factor, 1 sigma.
@@ -260,6 +261,11 @@ class Contents:
         return bool(abs(weighs / motion) < LEFT_OUT) if std < KNOWN_TO else None
 
 
+def _range(y: np.ndarray) -> float:
+    """Of the numbers that are there."""
+    return float(np.ptp(y[np.isfinite(y)])) if np.isfinite(y).any() else 0.0
+
+
 def _si(columns, match: Match) -> np.ndarray:
     return match.scale * columns[match.column] + match.offset
 
@@ -308,7 +314,8 @@ def _without_empty(columns, matches: Sequence[Match], said) -> list[Match]:
             continue
         y = columns[match.column]
         y = y[np.isfinite(y)]
-        moves = own is not None and np.nanstd(columns[own.column]) > 0.0
+        # One that is held gives way a little.
+        moves = own is not None and _range(_si(columns, own)) > GIVES_WAY
         if len(y) and (np.ptp(y) > 0.0 or not moves) or match.why == AS_SAID:
             continue
         why = "empty" if not len(y) else f"{y[0]:.4g} throughout while the joint moves"
