@@ -17,10 +17,4 @@ contact_mpc/multibody/ asks a MultibodyPlant and is no system. Systems never imp
 other. Which packages may use whose numerics is in MATHS_OF in tests/test_code.py.
 """
 
-import sys
-
-from makebreak.systems.moved import FormerNames
 from makebreak.systems.numerics import code_cache as code_cache
-
-if not any(isinstance(finder, FormerNames) for finder in sys.meta_path):
-    sys.meta_path.insert(0, FormerNames())

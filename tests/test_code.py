@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 
 from makebreak.scripts.experiments import EXPERIMENTS, load_experiment
-from makebreak.systems.moved import MOVED
 from makebreak.systems.numerics.code_cache import user_cache
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -106,12 +105,6 @@ def imported_modules(tree, package):
                 yield node.lineno, node.value
 
 
-def is_former(name):
-    """Whether makebreak.systems.c3_mpc.C3Mpc is a name from before the wings."""
-    parts = name.split(".")
-    return any(".".join(parts[:k]) in MOVED for k in range(3, len(parts) + 1))
-
-
 def may_use(parts, other):
     """Whether maths `other` is for a file of systems/."""
     own, there = wing_of(parts), wing_of(other)
@@ -134,10 +127,6 @@ def breaches(root):
                 found.append(f"{where}: expected makebreak.{name}")
             elif first == "pydrake" and here.endswith("numerics"):
                 found.append(f"{where}: numerics must not import pydrake")
-            elif is_former(name):
-                found.append(f"{where}: a former name")
-            elif name == "makebreak.systems.moved.FormerNames":
-                continue  # What stands in for former names is no system.
             elif first == "makebreak" and rest and rest[0] in ROOMS:
                 there = room_of(tuple(rest))
                 if there not in MAY_IMPORT[here]:
@@ -221,11 +210,6 @@ def test_imports_go_one_way():
             "from makebreak.systems.contact_mpc.numerics.lcs import LCS",
         ),
         ("systems/arm/numerics/a.py", "from makebreak.gap.numerics.selection import S"),
-        (
-            "systems/contact_mpc/numerics/a.py",
-            "from makebreak.systems.numerics.packed import packed",
-        ),
-        ("diagrams/a.py", "from makebreak.systems.c3_mpc import C3Mpc"),
         ("systems/arm/a.py", "from makebreak.models import scene"),
         ("systems/arm/a.py", "import_module('makebreak.diagrams.station')"),
         ("models/a.py", "from makebreak import diagrams"),
