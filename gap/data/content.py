@@ -54,6 +54,7 @@ GAINS = (0.45, 1.6)
 # Shares of an effort that is the weight's, to tell by; of the weight that one without
 # it may still have.
 WEIGHS, LEFT_OUT = 0.1, 0.2
+NO_WEIGHT = 0.02  # Of what an effort without weight leaves at most.
 # Of one joint alone, what it carries may make its effort so many times larger; what
 # holds it up, smaller.
 LARGE, LARGER = 20.0, 3.0
@@ -495,7 +496,9 @@ def _without_weight(contents: Contents, matches, said) -> None:
     n, with_weight = len(names), contents.needed
     best = _assigned(_left(efforts, contents.of_effort, n), efforts)[1]
     contents.needed = with_weight - contents.weight
-    if _assigned(_left(efforts, contents.of_effort, n), efforts)[1] > best:
+    after = _assigned(_left(efforts, contents.of_effort, n), efforts)[1]
+    # Another direction of gravity leaves more.
+    if after > min(best, np.log(NO_WEIGHT)):
         contents.needed = with_weight  # Swapped columns may look like it.
         return
     column, at = next(key for key, x in lacks.items() if x)
