@@ -12,7 +12,12 @@ from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.data.table import write_recording
-from makebreak.gap.report.comparison import comparison_html, errors_of, shown_motion
+from makebreak.gap.report.comparison import (
+    _side,
+    comparison_html,
+    errors_of,
+    shown_motion,
+)
 from makebreak.gap.report.files import write_report
 from makebreak.gap.residuals.objects import FlightProblem
 from makebreak.gap.result import Estimate, Evidence, GapResult, NamedEffect, plain
@@ -272,3 +277,13 @@ def test_the_page_says_the_error_of_each_frame_and_draws_the_measured_last(tmp_p
     parts = re.findall(r"base64,([A-Za-z0-9+/=]+)", page)
     blob = b"".join(base64.b64decode(each) for each in parts)
     assert blob.find(b"/before/") < blob.find(b"/measured/")
+
+
+@pytest.mark.parametrize("at", [(0.3, 0.0), (-0.3, 0.0), (0.0, 0.3), (0.2, -0.2)])
+def test_what_stands_still_does_not_hide_what_moves(at):
+    """A leg beside its base is seen from its own side of it."""
+    target = np.array([*at, -0.2])
+    side = _side(target, [np.array([0.05, 0.0, 0.0]), np.array([-0.05, 0.0, 0.1])])
+    assert side[:2] @ np.array(at) > 0.6 * np.linalg.norm(at) * np.linalg.norm(side[:2])
+    assert side[2] > 0.0
+    np.testing.assert_array_equal(_side(target, []), _side(target, [target]))

@@ -259,12 +259,14 @@ def _draw(
         frames_per_second=1.0 / _JUMP_SEC, set_visualizations_while_recording=False
     )
     seen: list[np.ndarray] = []
+    behind: list[np.ndarray] = []
     for who, one in loaded.items():
         moving, still = _shapes(one)
         if who == "measured":
             for path, body, pose, shape in still:
                 _put(meshcat, f"/scene/{path}", shape, _STILL, pose)
                 meshcat.SetTransform(f"/scene/{path}", body @ pose)
+                behind.append((body @ pose).translation())
         for path, _, pose, shape in moving:
             _put(meshcat, f"/{who}/{path}", shape, _COLOURS[who], pose)
         plant, context = one.plant, one.plant.CreateDefaultContext()
@@ -292,7 +294,19 @@ def _draw(
         low, high = np.min(seen, axis=0), np.max(seen, axis=0)
         target = 0.5 * (low + high)
         away = 0.9 * max(float(np.linalg.norm(high - low)), 0.4)
-        meshcat.SetCameraPose(target + away * np.array([0.9, -1.1, 0.6]), target)
+        meshcat.SetCameraPose(target + away * _side(target, behind), target)
+
+
+def _side(target: np.ndarray, behind: list[np.ndarray]) -> np.ndarray:
+    """(3,) From where to look at target (3,) [m]: what stands still, about the points
+    behind, is not to hide what moves."""
+    way = np.zeros(2) if not behind else (target - np.mean(behind, axis=0))[:2]
+    angles = np.deg2rad(-50.0 + 45.0 * np.array([0, 1, -1, 2, -2, 3, -3, 4]))
+    sides = np.column_stack([np.cos(angles), np.sin(angles)])
+    free = sides @ way
+    # The first of those that are about as free.
+    best = sides[np.argmax(free > free.max() - 0.3 * np.linalg.norm(way) - 1e-9)]
+    return np.array([*(1.42 * best), 0.6])
 
 
 def _put(meshcat: Meshcat, path: str, shape, colour: Rgba, pose: RigidTransform):
