@@ -16,7 +16,11 @@ class CompilingShown:
     Args:
         show: called with e.g. "compiling lcp.solve", and with "" after it.
         first: called before the first one.
+
+    of: (k, n) while the k-th of n parts is compiled: "compiling k of n: lcp.solve".
     """
+
+    of: tuple[int, int] | None = None
 
     def __init__(
         self, show: Callable[[str], None], first: Callable[[], None] = lambda: None
@@ -35,7 +39,8 @@ class CompilingShown:
             self._first = False
             self._at_first()
         module = function.__module__.rpartition(".")[2]
-        self._show(f"compiling {module}.{function.__name__}")
+        part = "" if self.of is None else f"{self.of[0]} of {self.of[1]}: "
+        self._show(f"compiling {part}{module}.{function.__name__}")
 
     def _end(self, _: event.Event) -> None:
         self._depth -= 1

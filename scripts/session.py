@@ -43,6 +43,7 @@ from makebreak.scripts.table import json_value
 from makebreak.scripts.trials import run_many
 from makebreak.systems.faults.safety_monitor import verdict
 from makebreak.systems.numerics.first_calls import deferred
+from makebreak.systems.views.legend import Legend
 
 __all__ = ["Log", "Session", "run_many"]
 
@@ -227,10 +228,15 @@ class Session:
             CatchInterrupt() as interrupt,
             RunButtons(self.meshcat, self.restarts) as buttons,
             self._bar(duration, label) as bar,
-            CompilingShown(partial(_tell, bar), self.on_first_compile),
+            CompilingShown(
+                partial(_tell, bar, diagram), self.on_first_compile
+            ) as compiling,
         ):
+            parts = len(self.first_calls)
             while self.first_calls and not interrupt.hit:
+                compiling.of = parts - len(self.first_calls) + 1, parts
                 self.first_calls.pop(0)()
+            compiling.of = None
             # Compiling, or reading what was compiled, is none of the simulation's time.
             wall_start, cpu_start = perf_counter(), process_time()
             try:
@@ -469,8 +475,12 @@ def _show_scene(diagram: Diagram, root: Context) -> None:
             system.ForcedPublish(system.GetMyContextFromRoot(root))
 
 
-def _tell(bar: tqdm, text: str) -> None:
-    """Shows on the progress bar what is being compiled, "" for nothing."""
+def _tell(bar: tqdm, diagram: Diagram, text: str) -> None:
+    """Shows on the progress bar and in the diagram's legend what is being compiled, ""
+    for nothing."""
+    for system in leaf_systems(diagram):
+        if isinstance(system, Legend):
+            system.note(text)
     bar.set_postfix_str(text, refresh=False)
     if sys.stderr.isatty():
         bar.refresh()

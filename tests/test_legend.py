@@ -23,7 +23,7 @@ class Page:
     """Stands for Meshcat: what is drawn, and when each path is visible."""
 
     def __init__(self):
-        self.lines, self.visible = {}, {}
+        self.lines, self.visible, self.deleted = {}, {}, []
 
     def SetLine(self, path, points, width, color):
         self.lines[path] = np.array(points).T
@@ -33,6 +33,7 @@ class Page:
         self.visible.setdefault(path, []).append((t, value))
 
     def Delete(self, path):  # What was recorded of it stays.
+        self.deleted.append(path)
         for each in [k for k in self.lines if f"{k}/".startswith(f"{path}/")]:
             del self.lines[each]
 
@@ -176,6 +177,20 @@ def test_a_legend_is_in_the_upper_left_of_what_the_camera_sees_and_faces_it():
     below = below - scene.poses[f"{ROOT}/phase/0"].translation()
     height = scene.objects[f"{ROOT}/lines"].scale3()[2]
     assert below @ up > 2 * height  # Below both lines.
+
+
+def test_a_note_stands_below_the_phase_until_it_is_taken_away():
+    scene = Scene()
+    _, _, diagram = legend(scene)
+    board = diagram.GetSubsystemByName("legend")
+    board.note("compiling 1 of 2")
+    above = scene.poses[f"{ROOT}/phase/0"].translation()
+    height = scene.objects[f"{ROOT}/note"].scale3()[2]
+    assert above[2] - scene.poses[f"{ROOT}/note"].translation()[2] > 0.5 * height
+    del scene.objects[f"{ROOT}/note"]
+    board.note("")
+    assert f"{ROOT}/note" not in scene.objects
+    assert scene.deleted[-1] == f"{ROOT}/note"
 
 
 def test_a_camera_that_looks_straight_down_sees_the_legend_too():

@@ -31,7 +31,9 @@ from makebreak.scripts.settings import (
     load_config,
 )
 from makebreak.scripts.table import Table
+from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.timing import timed
+from makebreak.systems.views.legend import Legend, LegendConfig
 
 
 def ramp():
@@ -365,6 +367,34 @@ def test_what_is_compiled_is_told_and_what_was_compiled_is_not(capsys):
     assert capsys.readouterr().err.splitlines() == [FIRST]
     outer(1)  # Of other types; nobody listens any more.
     assert len(seen) == 2
+
+
+def test_the_legend_says_which_of_the_first_calls_compiles(tmp_path, monkeypatch):
+    told: list[str] = []
+    monkeypatch.setattr(Legend, "note", lambda _, text: told.append(text))
+
+    def function_of(name):
+        @numba.njit
+        def function(x):
+            return x + 1.0
+
+        function.py_func.__module__ = "makebreak.systems.arm.numerics.made_up"
+        function.py_func.__name__ = name
+        return function
+
+    builder = DiagramBuilder()
+    meshcat = Meshcat()
+    builder.AddNamedSystem("legend", Legend(LegendConfig(), meshcat))
+    with session(tmp_path, meshcat=meshcat) as own:
+        for name in ("one", "two"):
+            first_call(function_of(name), 1.0)
+        own.simulate(builder.Build(), 0.1, {})
+    assert told == [
+        "compiling 1 of 2: made_up.one",
+        "",
+        "compiling 2 of 2: made_up.two",
+        "",
+    ]
 
 
 def test_result_json_is_flat_in_the_given_order_and_without_nan(tmp_path):

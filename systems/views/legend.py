@@ -53,6 +53,12 @@ class Legend(LeafSystem):
             self._shown, self._time = -2, np.inf  # Phase on the page, and its time.
             self.DeclarePeriodicPublishEvent(config.period_sec, 0.0, self._publish)
 
+    def note(self, text: str):
+        """Shows a line below the others, until the next call; "": none."""
+        self._meshcat.Delete(f"{ROOT}/note")
+        below = len(self._config.lines) + 1.6 * bool(self._config.phases) + 0.3
+        self._draw(f"{ROOT}/note", [(text, None)] if text else [], below)
+
     def _draw(self, path, lines, below: float):
         if not lines:
             return
