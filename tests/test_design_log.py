@@ -244,21 +244,21 @@ def test_gap_knows_more_from_a_designed_log_than_from_random_ones(tmp_path):
     for _ in range(3):
         x = np.append(0.3 * rng.uniform(-1, 1, 2), rng.normal(size=2 * free))
         motions.append(wanted.problem.within(wanted.problem.motion_of(x), 0.95))
-    widths = []
+    deviations = []
     for k, excitation in enumerate(motions):
         fine = replace(found, excitation=excitation, plan=replace(plan, rate_hz=1e3))
         log = played(truth, fine.columns(), rng)
         write_recording(tmp_path / f"log_{k}.csv", log)
         result = run_gap(tmp_path / "scene.yaml", [tmp_path / f"log_{k}.csv"])
         told = {(e.kind, e.at[0]): e.parameters for e in result.effects}
-        widths.append([
-            (p := told[kind, at][name]).high - p.low
+        deviations.append([
+            told[kind, at][name].std
             if (kind, at) in told else np.inf
             for kind, at, values in HIDDEN for name in values
         ])  # fmt: skip
-        print(k, result.verdict, widths[-1], [e.says for e in result.effects])
-    designed, *random = np.array(widths)
+        print(k, result.verdict, deviations[-1], [e.says for e in result.effects])
+    designed, *random = np.array(deviations)
     assert np.isfinite(designed).all()
-    # The product of the widths is what the design makes small.
+    # The product of the deviations is what the design makes small.
     for other in random:
         assert np.prod(designed) < np.prod(other)
