@@ -506,6 +506,75 @@ def sign_and_gear(log: Log):
     return ("in another unit, and of the other sign",)
 
 
+def renamed(position, velocity, effort, time="time"):
+    """Columns as other loggers call them; {} is the joint's number."""
+
+    def wrong(log: Log):
+        new = {"position": position, "velocity": velocity, "effort": effort}
+        own = {}
+        for name, y in log.columns.items():
+            joint, what = name.split("_")
+            own[new[what].format(joint.removeprefix("joint"))] = y
+        log.columns = {time: log.time} | own
+        log.write = lambda folder, columns: csv_of(folder / "log.csv", columns)
+        return ("",)
+
+    return wrong
+
+
+def csv_of(path: Path, columns: dict, header=None, text=None) -> Path:
+    """A csv with its first column as text, if given."""
+    rows = []
+    for k, row in enumerate(zip(*columns.values(), strict=True)):
+        cells = [f"{x:.12g}" for x in row]
+        if text is not None:
+            cells[0] = text[k]
+        rows.append(",".join(cells))
+    path.write_text("\n".join([",".join(header or columns), *rows]) + "\n")
+    return path
+
+
+def clock_text(log: Log):
+    text = [f"22:{int(t // 60):02d}:{t % 60:09.6f}" for t in log.time]
+    log.columns = {"time": log.time} | log.columns
+    log.write = lambda folder, columns: csv_of(folder / "log.csv", columns, text=text)
+    return ("",)
+
+
+def with_index(log: Log):
+    """As pandas writes a frame, with a column of row numbers that has no name."""
+    log.columns = {"": np.arange(len(log.time)), "time": log.time} | log.columns
+    log.write = lambda folder, columns: csv_of(folder / "log.csv", columns)
+    return ("",)
+
+
+def twice_named(log: Log):
+    """Two columns of one name, as of two sources in one frame."""
+    log.columns = {"time": log.time} | log.columns
+    own = [*log.columns, "joint1_effort"]
+
+    def write(folder: Path, columns: dict) -> Path:
+        more = columns | {"again": columns["joint1_effort"]}
+        return csv_of(folder / "log.csv", more, header=own)
+
+    log.write = write
+    return ("(again)",)
+
+
+def hundredths(log: Log):
+    """Of a degree, as whole numbers."""
+    for i, name in enumerate(names(log, "position")):
+        if not log.slides[i]:
+            log.columns[name] = np.rint(100.0 * np.rad2deg(log.columns[name]))
+    return ("deg",) if not all(log.slides) else ("",)
+
+
+def swapped_and_sign(log: Log):
+    signs(log)
+    swapped("effort")(log)
+    return ("swapped",)
+
+
 def missing_effort(log: Log):
     name = names(log, "effort")[-1]
     del log.columns[name]
@@ -617,8 +686,22 @@ KINDS = {
     "torque limits first": noisy_column("joint{}_torque_limit", 80.0, "torque_limit"),
     "velocity error first": decoy("joint{}_velocity_error", noise, "velocity_error"),
     "an IMU on the base": hung,
+    # A second time.
+    "names of a controller": renamed("actualPos{}", "actualVel{}", "actualTorque{}"),
+    "names of a topic": renamed(
+        "/arm/joint{}/pos", "/arm/joint{}/vel", "/arm/joint{}/eff", "/arm/stamp"
+    ),
+    "names in German": renamed(
+        "Winkel {} [rad]", "Geschw {} [rad/s]", "Moment {} [Nm]", "Zeit [s]"
+    ),
+    "seconds since 1970": stamps(lambda log: 1.7e9 + log.time, ""),
+    "time of day": clock_text,
+    "a frame's index": with_index,
+    "a name that comes twice": twice_named,
+    "positions in hundredths of a degree": hundredths,
+    "efforts swapped and of other sign": swapped_and_sign,
 }  # fmt: skip
-UNSEEN = list(KINDS)[list(KINDS).index("npz with names and dt") :]
+UNSEEN = list(KINDS)[list(KINDS).index("names of a controller") :]
 
 
 @dataclass(frozen=True)

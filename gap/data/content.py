@@ -69,6 +69,9 @@ _UNITS = (
 )  # fmt: skip
 
 
+# [rad] Degrees, tenths to thousandths of them, mrad, steps of encoders.
+_ANGLES = (*(np.pi / 180.0 * 10.0**-k for k in range(4)), 1e-3,
+           *(TURN / 2.0**bits for bits in range(9, 25)))  # fmt: skip
 _TIMES = (*(10.0**k for k in range(-6, 7)), 60.0, 3600.0)
 
 
@@ -289,6 +292,7 @@ def by_content(
         return matches, said
     except ValueError:
         return matches, said
+    matches, contents = _in_units_by_speeds(contents, matches, said)
     matches, contents = _rightly_timed(contents, matches, said)
     matches = _rightly_signed(contents, matches, said)
     _without_weight(contents, matches, said)
@@ -373,6 +377,41 @@ def _speed_factors(contents: Contents, matches) -> dict[int, float]:
                 by_motion = m.why.endswith(BY_DERIVATIVE)
                 found[number[at]] = x.factor / (1.0 if by_motion else m.scale)
     return found
+
+
+def _in_units_by_speeds(contents: Contents, matches, said):
+    """Angles too large for their joints in the unit that makes their rates the
+    velocities: one of drivers and encoders, the same for all."""
+    mine = [i for i, j in enumerate(contents.joints) if not j.prismatic]
+    factors = _speed_factors(contents, matches)
+    each = np.array([factors[i] for i in mine if i in factors])
+    limits = np.abs(
+        [(contents.joints[i].lower, contents.joints[i].upper) for i in mine]
+    )
+    most = limits.reshape(-1, 2).max(axis=1)
+    most = np.where(np.isfinite(most), most, 10.0 * TURN)
+    if len(each) < len(mine) or not mine or (each <= 0.0).any():
+        return matches, contents
+    if not (np.abs(contents.q[:, mine]).max(axis=0) > 2.0 * most).any():
+        return matches, contents
+    unit = min(_ANGLES, key=lambda u: abs(np.log(u * each[0])))
+    if (np.abs(unit * each - 1.0) > ALIKE).any():
+        return matches, contents
+    names = {contents.joints[i].name for i in mine}
+    out, moved = [], []
+    for m in matches:
+        at, _, what = (m.channel or "").rpartition(".")
+        if "position" in what and at in names and m.why != AS_SAID:
+            why = f"{m.why}; in units of {unit:.6g} rad, by the velocities"
+            m = replace(m, scale=m.scale * unit, offset=m.offset * unit, why=why)
+            moved.append(m.column)
+        out.append(m)
+    says = (
+        f"By the velocities, {', '.join(moved)} are in units of {unit:.6g} rad "
+        f"({np.rad2deg(unit):.4g} deg)."
+    )
+    said.append(Said("position_unit", contents.joints[mine[0]].name, unit, says))
+    return out, contents.at_times(out)
 
 
 def _rightly_timed(contents: Contents, matches, said):
@@ -705,7 +744,7 @@ def _factors(
     alike = within > 0.0 and len(known) > 1
     if not alike:
         known = {
-            i: x for i, x in known.items() if abs(x.factor) > GAINS[1]
+            i: x for i, x in known.items() if not 0.0 < x.factor < GAINS[1]
             or _not_a_rotor(contents, found[i][0], i, x.factor)
         }  # fmt: skip
         middle, within = _one_factor(list(known.values()))

@@ -29,6 +29,12 @@ _STAMP = re.compile(
 )
 
 
+# A time of day alone.
+_CLOCK = re.compile(
+    rb"(?<![\w:.-])([0-2]?\d):([0-5]\d):([0-5]\d)(?:[.,](\d+))?(?![\w:])"
+)
+
+
 @dataclass(frozen=True)
 class Dialect:
     """How a csv file is written. names: of its columns; lists: {column: how many
@@ -208,10 +214,12 @@ def dialect_of(
     headless = _are_values(names, separator)
     if headless:
         names = [f"{NAMELESS}{i + 1}" for i in range(len(names))]
-    for name in names:
-        if names.count(name) > 1:
-            raise ValueError(f'recording {path}: column "{name}" is there twice')
-    stamped = _STAMP.search(header + sample) is not None
+    for k, name in enumerate(names):
+        if name in names[:k]:
+            if name.count(".") > 1 or not name:  # As a channel's.
+                raise ValueError(f'recording {path}: column "{name}" is there twice')
+            names[k] = name + " (again)" * names[:k].count(name)
+    stamped = any(each.search(header + sample) for each in (_STAMP, _CLOCK))
     lines = _in_seconds(sample).decode(errors="replace").splitlines()[:50]
     lists: dict[str, int] = {}
     if "[" in "".join(lines):
@@ -247,7 +255,12 @@ def _in_seconds(text: bytes) -> bytes:
             return found.group()
         return b"%d.%s" % (int(at.timestamp()), fraction or b"0")
 
-    return _STAMP.sub(seconds, text)
+    def of_day(found: re.Match[bytes]) -> bytes:
+        hours, minutes, rest, fraction = found.groups()
+        whole = 3600 * int(hours) + 60 * int(minutes) + int(rest)
+        return b"%d.%s" % (whole, fraction or b"0")
+
+    return _CLOCK.sub(of_day, _STAMP.sub(seconds, text))
 
 
 def is_nameless(column: str) -> bool:

@@ -31,7 +31,7 @@ _COMMAND = set(
 _WORDS = {
     "acceleration": set("acc acceleration accelerations ddq qdd accel".split()),
     "current": set("current currents amp amps ampere".split()),
-    "effort": set("effort efforts torque torques tau trq moment moments u".split()),
+    "effort": set("effort efforts eff torque torques tau trq moment moments u".split()),
     "force": set("force forces thrust".split()),
     "velocity": set(
         "velocity velocities vel vels dq qd qdot speed speeds omega velo v".split()
