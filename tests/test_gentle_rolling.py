@@ -46,6 +46,7 @@ from makebreak.systems.changing_contact.numerics.contact_task import (
     MADE,
     ContactBelief,
 )
+from makebreak.systems.changing_contact.numerics.motion_pattern import least_time
 from makebreak.systems.changing_contact.numerics.push_motion import (
     BALL_SEGMENT,
     TABLE_SEGMENT,
@@ -108,9 +109,12 @@ def test_the_way_behind_the_ball_clears_it_and_ends_straight_down(start):
     assert end[2] < R_BALL + np.sqrt((R_BALL + R_TIP) ** 2 - 0.018**2) - 0.015
 
 
-def test_a_way_from_the_ball_takes_the_brisk_time():
-    pattern = ball_pattern(PushConfig(), IN_FRONT, HEADING, R_BALL, R_TIP, 5.0)
-    assert np.ptp(pattern.segments[0].times) == pytest.approx(0.4)
+def test_a_way_from_the_ball_takes_the_brisk_time_or_what_its_bend_needs():
+    for a_max in (5.0, 10.0):
+        pattern = ball_pattern(PushConfig(), IN_FRONT, HEADING, R_BALL, R_TIP, a_max)
+        least = least_time(pattern.segments[0], a_max, stops=False)
+        assert np.ptp(pattern.segments[0].times) == pytest.approx(max(0.4, least))
+        assert (least > 0.4) == (a_max == 5.0)
 
 
 def test_the_way_to_the_table_ends_ahead_of_the_ball_and_slides_away_from_it():
