@@ -10,7 +10,15 @@ from makebreak.gap.by_part import joined, limbs_of, only, pooled
 from makebreak.gap.data.findings import Finding
 from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.data.split import split
-from makebreak.gap.result import Estimate, Evidence, GapMeasure, GapResult, NamedEffect
+from makebreak.gap.report.comparison import shown_motion
+from makebreak.gap.result import (
+    Estimate,
+    Evidence,
+    GapMeasure,
+    GapResult,
+    NamedEffect,
+    Series,
+)
 from makebreak.gap.workflow import run_gap
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.scene import read_scene
@@ -187,3 +195,26 @@ def test_errors_are_pooled_by_windows_and_a_channel_counts_where_it_is():
     assert both.per_channel["r.a0.position"]["before"] == pytest.approx(3.0)
     assert both.per_channel["r.b0.position"]["before"] == pytest.approx(5.0)
     assert both.n_windows == 4
+
+
+def test_limbs_with_windows_of_their_own_are_shown_together(tmp_path):
+    scene, file = recorded(tmp_path, [], 2.0)
+    recordings = read_recordings([file])
+
+    def series(joint, n, off):
+        y = recordings[0][f"{joint}.position"][:n]
+        time = recordings[0].time[:n]
+        return Series(f"{joint}.position", recordings[0].name, 0, time, y, y + off, y,
+                      np.zeros(1), 1e-4)  # fmt: skip
+
+    each = [
+        replace(result_of("gap_named"), series=[series(j, n, off) for j in limb])
+        for limb, n, off in zip(LIMBS, (40, 30), (0.1, 0.01), strict=True)
+    ]
+    motion = shown_motion(joined(LIMBS, each), SceneDynamics(scene).plant, recordings)
+    assert motion is not None and len(motion.time) == 40
+    before = motion.columns["before"]
+    for limb, off in zip(LIMBS, (0.1, 0.0), strict=True):
+        for joint in limb:
+            y = recordings[0][f"{joint}.position"][:40]
+            np.testing.assert_allclose(before[f"{joint}.position"] - y, off, atol=1e-9)

@@ -101,12 +101,14 @@ def shown_motion(
     result: GapResult, plant: MultibodyPlant, recordings: Sequence[Recording]
 ) -> Motion | None:
     """The coordinates of a plant in the report's windows, of the recording whose
-    windows are farthest off; None where no coordinate was simulated."""
+    windows are farthest off; None where no coordinate was simulated. Limbs may have
+    windows of their own: what moves in others is shown as it was measured."""
     wanted = _position_channels(plant)
-    groups: dict[tuple[str, int], list[Series]] = {}
+    groups: dict[tuple[str, int, bytes], list[Series]] = {}
     for each in result.series:
         if each.channel in wanted:
-            groups.setdefault((each.recording, each.episode), []).append(each)
+            key = each.recording, each.episode, each.time.tobytes()
+            groups.setdefault(key, []).append(each)
     if not groups or result.gap.window_s <= 0.0:
         return None
     some = max(groups.values(), key=lambda g: max(map(_off, g)))
