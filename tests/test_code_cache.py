@@ -8,7 +8,9 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
+import numba
 import pytest
+from numba.core import caching
 from numba.core.registry import CPUDispatcher
 
 from makebreak.systems.numerics import code_cache, filters
@@ -145,3 +147,18 @@ def test_what_is_long_out_of_use_is_deleted(tmp_path):
     code_cache._used(tmp_path / "m.a-3")
     names = {folder.name for folder in tmp_path.iterdir()}
     assert names == {"m.a-2", "m.a-3", "m.ab-1"}
+
+
+def test_code_that_cannot_be_written_serves_this_process_alone(monkeypatch, tmp_path):
+    """As on a full disk: Numba's own would end in an error after the compiling."""
+
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(caching.IndexDataCacheFile, "save", full)
+    double = numba.njit(cache=True)(_double)
+    assert double(2.0) == 4.0
+
+
+def _double(x):
+    return 2.0 * x

@@ -353,7 +353,7 @@ def running():
             system.compute_sec.clear()
     simulator.AdvanceTo(0.5)
     count = updates(diagram)
-    simulator.AdvanceTo(2.4)
+    simulator.AdvanceTo(3.2)
     return SimpleNamespace(
         diagram=diagram,
         context=simulator.get_context(),

@@ -122,3 +122,15 @@ if not CONFIG.CACHE_LOCATOR_CLASSES:
     own = f"{__name__}.{BySource.__name__}"
     others = (locator.__name__ for locator in caching.CacheImpl._locator_classes)
     CONFIG.CACHE_LOCATOR_CLASSES = ",".join((own, *others))
+
+
+def _save_or_not(cache, signature, code, save=caching.Cache.save_overload):
+    """Numba's own, but where a file cannot be written (a full disk) the code serves
+    this process alone."""
+    try:
+        save(cache, signature, code)
+    except OSError:
+        pass
+
+
+caching.Cache.save_overload = _save_or_not  # type: ignore[method-assign]
