@@ -275,11 +275,16 @@ def _limits(scene: Scene, plant, joints, names, plan: LogPlan) -> Limits:
         }
         if not np.isfinite([lower, upper]).all():
             raise ValueError(f"{names[k]} has no limits of position in its model")
-        for what in ("velocity", "effort"):
-            if not np.isfinite(row[what]):
-                raise ValueError(
-                    f"{names[k]} has no limit of {what} in its model: give --{what}, "
-                    f"a number for all joints or {names[k]}=NUMBER"
-                )
         rows.append(row)
+    lacks = {
+        what: [n for n, row in zip(names, rows, strict=True) if row[what] == np.inf]
+        for what in ("velocity", "effort")
+    }
+    if any(lacks.values()):
+        each = [f"{what} ({', '.join(of)})" for what, of in lacks.items() if of]
+        options = " and ".join(f"--{what}" for what, of in lacks.items() if of)
+        raise ValueError(
+            f"the model has no limits of {' and '.join(each)}: give {options}, a "
+            f"number for all joints or JOINT=NUMBER"
+        )
     return Limits(**{key: np.array([row[key] for row in rows]) for key in rows[0]})

@@ -161,9 +161,8 @@ def test_the_command_writes_a_table_to_play(tmp_path, capsys):
     words += ["--period", "3", "--harmonics", "2", "--out", str(tmp_path / "out")]
     words += ["--for", "joint_viscous_damping", "link_com"]
     assert main(words) == 2
-    assert (
-        "no limit of velocity in its model: give --velocity" in capsys.readouterr().err
-    )
+    lacks = "no limits of velocity (p.j1) and effort (p.j1): give --velocity and"
+    assert lacks in capsys.readouterr().err
     assert main([*words, "--velocity", "4", "--effort", "p.j1=15", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     rows = {
