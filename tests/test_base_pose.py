@@ -105,3 +105,24 @@ def test_a_base_that_moves_is_an_error_and_one_that_is_not_told_is_said(tmp_path
     level = proposal(tmp_path, {})
     assert "level, as no column has its pose" in level.notes[0]
     assert not level.findings()
+
+
+@pytest.mark.parametrize(
+    ("names", "known"),
+    [
+        ([f"base_pos_{k}" for k in "xyz"], True),
+        ([f"base_position[{k}]" for k in range(3)], True),
+        ([f"torso_{k}" for k in "xyz"], True),  # The body's own name.
+        ([f"imu_{k}" for k in "xyz"], False),  # Of what?
+        ([f"base_lin_vel_{k}" for k in "xyz"], False),
+        ([f"object_pos_{k}" for k in "xyz"], False),
+    ],
+)
+def test_where_a_base_is_is_read_of_a_place_alone(names, known):
+    n, place = 50, (0.1, -0.2, 0.9)
+    log = {f"torso_quat_{k}": np.full(n, float(k == "w")) for k in "wxyz"}
+    log |= {name: np.full(n, x) for name, x in zip(names, place, strict=True)}
+    found = base_pose([log], ["torso"])
+    assert found is not None and found.is_still
+    assert found.position == pytest.approx(place if known else (0.0, 0.0, 0.0))
+    assert set(names) <= set(found.columns) if known else len(found.columns) == 4

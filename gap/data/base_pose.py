@@ -130,9 +130,7 @@ def _position(
         words = set(words_of(prefix))
         if words & (_NOT | _TURNS - {"pose"}) or _rank(words, bases) > 1:
             continue
-        if not words & {"pos", "position", "xyz", "translation", "pose", *bases} and (
-            not set(parts) >= {"x", "y", "z", "w"}
-        ):
+        if not words & {"pos", "position", "xyz", "translation", "pose", *bases}:
             continue
         if words & {"vel", "velocity", "lin", "ang", "acc", "acceleration", "gravity"}:
             continue

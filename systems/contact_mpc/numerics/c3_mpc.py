@@ -154,12 +154,11 @@ class C3Problem:
         self.n_lam = n_contact // 2 if self.is_plus else n_contact
         self._check_consensus_weights(n_contact)
         bounds = C3Bounds() if bounds is None else bounds
-        self.upper = self._bound(np.inf, np.inf, u=bounds.u_upper, x=bounds.x_upper)
-        lower = self._bound(-np.inf, -np.inf, u=bounds.u_lower, x=bounds.x_lower)
-        i_x = self.n_lam + self.n_u
-        if not np.isinf(np.r_[lower[i_x:], self.upper[i_x:]]).all():
-            lower = self._bound(-np.inf, 0.0, u=bounds.u_lower, x=bounds.x_lower)
-        self.lower = lower
+        lower = self._bound(-np.inf, u=bounds.u_lower, x=bounds.x_lower)
+        upper = self._bound(np.inf, u=bounds.u_upper, x=bounds.x_upper)
+        if np.isfinite([a[self.n_lam + self.n_u :] for a in (lower, upper)]).any():
+            lower[: self.n_lam] = 0.0
+        self.lower, self.upper = _read_only(lower), _read_only(upper)
         for i in np.flatnonzero(~(self.lower <= self.upper)):
             raise ValueError(
                 f"C3Bounds: {self.lower[i]} to {self.upper[i]} for entry "
@@ -217,9 +216,9 @@ class C3Problem:
                 "without cost, expected R + G > 0"
             )
 
-    def _bound(self, unbounded, lam, u, x):
-        """A bound over [lam, u, x]."""
-        parts = [np.full(self.n_lam, lam)]
+    def _bound(self, unbounded, u, x):
+        """A bound over [lam, u, x]; none on lam."""
+        parts = [np.full(self.n_lam, unbounded)]
         for name, value, n in (("u", u, self.n_u), ("x", x, self.n_x)):
             part = np.full(n, unbounded) if value is None else np.asarray(value, float)
             if part.shape != (n,) or np.isnan(part).any():
@@ -227,7 +226,7 @@ class C3Problem:
                     f"C3Bounds: {name} is bounded by {part}, expected {n} numbers"
                 )
             parts.append(part)
-        return _read_only(np.concatenate(parts))
+        return np.concatenate(parts)
 
     def state_cost(self, x0, x_desired):
         """Q of the knots, of the last one, and targets: (x - target)' Q (x - target).
