@@ -45,7 +45,7 @@ STIFFNESS, REST_LENGTH = np.array([20.0, 40.0, 60.0]), 0.3
 
 @dataclass
 class BaselinesConfig:
-    """Tuned with one budget on seeds 100 to 113 (scripts/tune_planar.py)."""
+    """Tuned with one budget on seeds 100 to 113 (papers/tune_planar.py)."""
 
     mrac: MracConfig = field(default_factory=lambda: tuned_mrac(SPRINGS))
     active_inference: ActiveInferenceConfig = field(

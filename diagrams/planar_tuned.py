@@ -1,4 +1,4 @@
-"""Settings of the planar experiments' controllers, found by scripts/tune_planar.py."""
+"""Settings of the planar experiments' controllers, found by papers/tune_planar.py."""
 
 import json
 from dataclasses import dataclass
@@ -59,7 +59,7 @@ def _parts(setting: str, controller: str) -> list[dict]:
 
 
 def tuned_mrac(setting: str, controller: str = "mrac") -> MracConfig:
-    """Args: setting, controller: names as in scripts/tune_planar.py."""
+    """Args: setting, controller: names as in papers/tune_planar.py."""
     return MracConfig(**_parts(setting, controller)[0])
 
 

@@ -48,7 +48,7 @@ class PorridgeConfig:
     force_noise: float = 0.2
     impedance: PlanarImpedanceConfig = field(default_factory=_impedance)
     model: ForceModelConfig = field(default_factory=_model)
-    # Tuned on seeds 100 to 113 (scripts/tune_planar.py, docs/planar.md).
+    # Tuned on seeds 100 to 113 (papers/tune_planar.py, docs/planar.md).
     mrac: MracConfig = field(default_factory=lambda: tuned_mrac("porridge"))
 
 

@@ -10,7 +10,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 from makebreak import ContactMpcConfig, ContactPair, make_contact_mpc, model_path
-from makebreak.scripts.sweep import rate_text
+from makebreak.scripts.runner.sweep import rate_text
 
 
 def trial(seed):

@@ -23,8 +23,8 @@ from measured import cube_tosses, double_pendulum, so101
 from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.simulation.judge import judge
 from makebreak.models.scene import read_scene
-from makebreak.scripts import cli
-from makebreak.scripts.table import Table
+from makebreak.scripts.cli import commands as cli
+from makebreak.scripts.runner.table import Table
 
 # Of the loops: error of the ball's radius [m], seed. All were set beforehand.
 LOOPS = ((-0.005, 1), (-0.002, 3), (0.003, 4), (0.005, 0), (0.008, 2))

@@ -12,9 +12,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
-from makebreak.scripts.criteria import Criteria
-from makebreak.scripts.table import Table
-from makebreak.scripts.trials import run_many
+from makebreak.scripts.runner.criteria import Criteria
+from makebreak.scripts.runner.table import Table
+from makebreak.scripts.runner.trials import run_many
 from makebreak.systems.numerics.timing import timed
 
 SUMMARY = "A mass on a damped spring comes to rest."

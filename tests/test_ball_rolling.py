@@ -33,8 +33,8 @@ from makebreak.diagrams.camera import CameraConfig
 from makebreak.diagrams.scene_facts import sphere_radius
 from makebreak.diagrams.station import MODELS, make_control_plant
 from makebreak.models.scene import load_scene
-from makebreak.scripts import rolling_score
 from makebreak.scripts.cli import main
+from makebreak.scripts.experiments.papers import rolling_score
 from makebreak.systems.baselines.dynamics_residual import DynamicsResidual
 from makebreak.systems.contact_mpc.numerics.ball_state import P_BALL, P_TIP, pack
 from makebreak.systems.contact_mpc.numerics.c3_projections import (

@@ -4,11 +4,8 @@ import numpy as np
 import pytest
 from pydrake.systems.framework import DiagramBuilder
 
-from makebreak.gap.data.reading import check_against_scene, read_recordings
-from makebreak.gap.data.scene_facts import scene_names
-from makebreak.models.scene import load_scene, read_scene
-from makebreak.scripts import bench_sysid
-from makebreak.scripts.bench_gap import (
+from makebreak.benchmarks import sysid as bench_sysid
+from makebreak.benchmarks.gap import (
     FRICTION,
     FRICTION_JOINT,
     POSITION_NOISE,
@@ -16,6 +13,9 @@ from makebreak.scripts.bench_gap import (
     record,
     sum_of_sines,
 )
+from makebreak.gap.data.reading import check_against_scene, read_recordings
+from makebreak.gap.data.scene_facts import scene_names
+from makebreak.models.scene import load_scene, read_scene
 
 
 def test_the_arm_follows_its_sines_and_its_efforts_hold_friction(tmp_path):

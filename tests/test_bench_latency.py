@@ -11,9 +11,8 @@ from pydrake.systems.primitives import (
 )
 from pydrake.systems.sensors import ImageRgba8U
 
-from makebreak.diagrams.ball_rolling_config import LEARN
-from makebreak.scripts import bench_latency
-from makebreak.scripts.bench_latency import (
+from makebreak.benchmarks import latency as bench_latency
+from makebreak.benchmarks.latency import (
     ENCODERS,
     NUDGES,
     PICTURE,
@@ -22,6 +21,7 @@ from makebreak.scripts.bench_latency import (
     ages,
     make_nudged_station,
 )
+from makebreak.diagrams.ball_rolling_config import LEARN
 
 PERIOD, OFFSET = LEARN / 5, 1e-3
 

@@ -3,7 +3,7 @@
 import numba
 import pytest
 
-from makebreak.scripts import bench_push
+from makebreak.benchmarks import push as bench_push
 
 BATCH = {"one": 12.0, "all": 6.0}  # ms
 ALONE = {"general": 30.0, "analytic": 24.0}  # ms

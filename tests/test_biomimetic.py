@@ -6,8 +6,8 @@ from pydrake.systems.analysis import Simulator
 
 from makebreak.diagrams.planar import PlanarSensing, knowledge_of, make_planar
 from makebreak.diagrams.planar_tuned import SETTINGS
-from makebreak.scripts.planar_loops import learning_curve
-from makebreak.scripts.tune_planar import task_of
+from makebreak.scripts.experiments.papers.planar_loops import learning_curve
+from makebreak.scripts.experiments.papers.tune_planar import task_of
 from makebreak.systems.baselines.biomimetic import Biomimetic, BiomimeticConfig
 from makebreak.systems.baselines.numerics.biomimetic import (
     LearnedGains,

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from makebreak.scripts.bench_c3_light import problem_at, row
-from makebreak.scripts.bench_plants import OF_MASS, diagram_of, held_box
+from makebreak.benchmarks.c3_light import problem_at, row
+from makebreak.benchmarks.plants import OF_MASS, diagram_of, held_box
 from makebreak.systems.contact_mpc.lcs_builder import AnitescuLcs
 from makebreak.systems.contact_mpc.numerics.c3_active_set import MET, solve_active
 from makebreak.systems.contact_mpc.numerics.c3_bounds import within

@@ -17,7 +17,7 @@ from scipy.optimize import linprog, minimize
 from scipy.spatial.transform import Rotation
 
 from makebreak import model_path
-from makebreak.scripts.bench_c3 import (
+from makebreak.benchmarks.c3 import (
     OsqpC3,
     ball,
     cartpole,

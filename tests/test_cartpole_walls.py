@@ -25,8 +25,8 @@ from makebreak.diagrams.cartpole_walls import (
 from makebreak.models.scene import load_scene
 from makebreak.scripts.cli import main
 from makebreak.scripts.experiments import cartpole_walls as experiment
-from makebreak.scripts.session import Session
-from makebreak.scripts.settings import apply_settings
+from makebreak.scripts.runner.session import Session
+from makebreak.scripts.runner.settings import apply_settings
 from makebreak.systems.contact_mpc.numerics.cartpole import (
     CartPole,
     cartpole_lcs,

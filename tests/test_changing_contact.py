@@ -30,7 +30,7 @@ from makebreak.scripts.experiments import (
     multiple_collisions,
     surface_switch,
 )
-from makebreak.scripts.settings import apply_settings
+from makebreak.scripts.runner.settings import apply_settings
 from makebreak.systems.changing_contact.numerics.contact_task import (
     DONE,
     MADE,

@@ -22,11 +22,15 @@ import pytest
 import spring_mass
 
 import makebreak
-from makebreak.scripts import bench, cli, command_inputs, experiments, trials
-from makebreak.scripts.arguments import make_parser
-from makebreak.scripts.close_contact_loop import SETTINGS
-from makebreak.scripts.criteria import Criteria
-from makebreak.scripts.settings import apply_settings
+from makebreak.benchmarks import bench
+from makebreak.scripts import experiments
+from makebreak.scripts.cli import command_inputs
+from makebreak.scripts.cli import commands as cli
+from makebreak.scripts.cli.arguments import make_parser
+from makebreak.scripts.runner import trials
+from makebreak.scripts.runner.close_contact_loop import SETTINGS
+from makebreak.scripts.runner.criteria import Criteria
+from makebreak.scripts.runner.settings import apply_settings
 
 ALL = dict(experiments.EXPERIMENTS)
 PYPROJECT = Path(__file__).resolve().parent.parent / "pyproject.toml"
@@ -557,7 +561,7 @@ def test_bench_prints_table_and_json_and_outlives_a_failing_bench(
 
 
 def test_bench_diagrams_gives_the_real_time_factor_of_each_setting(monkeypatch):
-    from makebreak.scripts import bench_diagrams
+    from makebreak.benchmarks import diagrams as bench_diagrams
 
     monkeypatch.setattr(trials, "_COMMAND", spring_mass.COMMAND)
     monkeypatch.setattr(bench_diagrams, "EXPERIMENTS", experiments.EXPERIMENTS)

@@ -11,6 +11,7 @@ from effect_scenes import on_ground
 from pydrake.systems.framework import DiagramBuilder
 
 from makebreak import model_path
+from makebreak.benchmarks import loop_trials
 from makebreak.diagrams.ball_rolling_config import BallRollingConfig, controller_model
 from makebreak.diagrams.recorder import mean_until_next
 from makebreak.diagrams.scene_facts import sphere_radius
@@ -22,11 +23,10 @@ from makebreak.gap.simulation.windows import WindowModel
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import InitialSection, load_scene, read_scene
 from makebreak.models.scene_file import write_scene
-from makebreak.scripts import close_contact_loop as contact_loop
-from makebreak.scripts import close_the_loop as loop
-from makebreak.scripts import loop_trials
 from makebreak.scripts.cli import main
-from makebreak.scripts.close_the_loop import write_wrong_scene
+from makebreak.scripts.runner import close_contact_loop as contact_loop
+from makebreak.scripts.runner import close_the_loop as loop
+from makebreak.scripts.runner.close_the_loop import write_wrong_scene
 
 
 @pytest.mark.parametrize("radius", [0.0265, 0.0365])

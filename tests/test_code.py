@@ -14,10 +14,11 @@ from makebreak.scripts.experiments import EXPERIMENTS, load_experiment
 from makebreak.systems.numerics.code_cache import user_cache
 
 ROOT = Path(__file__).resolve().parent.parent
-ROOMS = ("models", "systems", "diagrams", "gap", "scripts")
+ROOMS = ("models", "systems", "diagrams", "gap", "scripts", "benchmarks")
 
 # Room -> what it may import: numerics <- multibody <- systems <- diagrams <- gap <-
-# scripts, and models <- diagrams. Systems meet at ports: they never import each other.
+# runner <- experiments <- cli and benchmarks, and models <- diagrams. Systems meet at
+# ports: they never import each other. runner loads an experiment by its name.
 MAY_IMPORT = {
     "numerics": {"numerics"},
     "multibody": {"numerics", "multibody"},
@@ -27,7 +28,11 @@ MAY_IMPORT = {
     "gap numerics": {"numerics", "gap numerics"},
 }
 MAY_IMPORT["gap"] = MAY_IMPORT["diagrams"] | {"gap numerics", "gap"}
-MAY_IMPORT["scripts"] = MAY_IMPORT["tests"] = MAY_IMPORT["gap"] | {"scripts"}
+MAY_IMPORT["runner"] = MAY_IMPORT["gap"] | {"runner", "scripts"}
+MAY_IMPORT["experiments"] = MAY_IMPORT["runner"] | {"experiments"}
+MAY_IMPORT["cli"] = MAY_IMPORT["scripts"] = MAY_IMPORT["experiments"] | {"cli"}
+MAY_IMPORT["benchmarks"] = MAY_IMPORT["cli"] | {"benchmarks"}
+MAY_IMPORT["tests"] = MAY_IMPORT["benchmarks"]
 
 # Wing of systems/ -> the wings of whose maths it may use beside its own; what is in
 # systems/numerics all may use.
@@ -71,6 +76,8 @@ def gap_room_of(parts):
 
 def room_of(parts):
     """The room of ("systems", "arm", "numerics", "packed"): "numerics"."""
+    if parts[0] == "scripts":  # What lists the experiments is for all.
+        return parts[1] if parts[2:3] not in ((), ("load_experiment",)) else "scripts"
     if "multibody" in parts[1:3]:
         return "multibody"
     if "numerics" not in parts[1:3]:
@@ -222,7 +229,11 @@ def test_imports_go_one_way():
         ("gap/residuals/a.py", "from makebreak.gap.search.screen import rank"),
         ("gap/search/a.py", "from makebreak.gap.workflow import run_gap"),
         ("gap/report/a.py", "from makebreak.gap.search.screen import rank"),
-        ("scripts/a.py", "from systems.contact_mpc.numerics.lcs import LCS"),
+        ("scripts/cli/a.py", "from systems.contact_mpc.numerics.lcs import LCS"),
+        ("scripts/runner/a.py", "from makebreak.scripts.cli.arguments import number"),
+        ("scripts/runner/a.py", "import makebreak.scripts.experiments.porridge"),
+        ("scripts/experiments/a.py", "from makebreak.scripts.cli.faults import fault"),
+        ("scripts/cli/a.py", "from makebreak.benchmarks.bench import bench"),
         ("tests/a.py", "import models"),
     ],
 )
@@ -257,7 +268,12 @@ def test_a_planted_breach_is_found(tmp_path, file, code):
             "diagrams/a.py",
             "from makebreak.systems.arm.b import B\nimport makebreak.models.c",
         ),
-        ("scripts/a.py", "import makebreak\nimport modelsearch\nx = 'makebreak'"),
+        ("scripts/cli/a.py", "from makebreak.scripts.runner.table import Table"),
+        (
+            "scripts/runner/a.py",
+            "from makebreak.scripts.experiments import load_experiment",
+        ),
+        ("scripts/cli/a.py", "import makebreak\nimport modelsearch\nx = 'makebreak'"),
     ],
 )
 def test_a_right_import_is_accepted(tmp_path, file, code):

@@ -5,12 +5,12 @@ from types import SimpleNamespace
 import pytest
 
 from makebreak.diagrams.multiple_collisions import MultipleCollisionsConfig
-from makebreak.scripts import comparison
-from makebreak.scripts.comparison import Comparison
 from makebreak.scripts.experiments.multiple_collisions import VARIANTS
-from makebreak.scripts.rolling_paper import PUSHES, adaptive_targets
-from makebreak.scripts.settings import apply_settings
-from makebreak.scripts.trials import setting_texts
+from makebreak.scripts.experiments.papers.rolling_paper import PUSHES, adaptive_targets
+from makebreak.scripts.runner import comparison
+from makebreak.scripts.runner.comparison import Comparison
+from makebreak.scripts.runner.settings import apply_settings
+from makebreak.scripts.runner.trials import setting_texts
 
 
 @pytest.fixture

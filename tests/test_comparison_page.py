@@ -29,7 +29,7 @@ from makebreak.gap.verdict import says
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import InitialSection, load_scene
 from makebreak.models.scene_schema import ActuationSection
-from makebreak.scripts.gap_command import effects_table
+from makebreak.scripts.cli.gap_command import effects_table
 
 COULOMB = Effect("joint_coulomb_friction", ["p.j1"], {"coulomb": 0.35})
 TIME = np.arange(300) * 0.01

@@ -5,7 +5,7 @@ import subprocess
 
 import pytest
 
-from makebreak.scripts import cli
+from makebreak.scripts.cli import commands as cli
 
 
 def completed(script, *words):

@@ -22,7 +22,7 @@ from makebreak.scripts.experiments.contact_learning import (
     scored,
     summary,
 )
-from makebreak.scripts.session import Session
+from makebreak.scripts.runner.session import Session
 from makebreak.systems.changing_contact.numerics.contact_task import (
     DIRECTION,
     DONE,

@@ -15,7 +15,7 @@ from makebreak.diagrams.contact_types import (
 )
 from makebreak.scripts.experiments import contact_types
 from makebreak.scripts.experiments.contact_types import right_modes, strokes_of
-from makebreak.scripts.session import Session
+from makebreak.scripts.runner.session import Session
 from makebreak.systems.changing_contact.numerics.contact_task import PHASE_SEGMENT
 
 

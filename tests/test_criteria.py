@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from makebreak.scripts.criteria import Criteria
+from makebreak.scripts.runner.criteria import Criteria
 
 
 @pytest.mark.parametrize("value", [None, np.nan])

@@ -31,12 +31,12 @@ from makebreak.diagrams.cube_pivoting_config import (
 )
 from makebreak.models.model_files import MODELS
 from makebreak.models.scene import load_scene
-from makebreak.scripts import comparison
 from makebreak.scripts.cli import main
 from makebreak.scripts.experiments import cube_pivoting as experiment
-from makebreak.scripts.session import Log
-from makebreak.scripts.settings import apply_settings
-from makebreak.scripts.trials import setting_texts
+from makebreak.scripts.runner import comparison
+from makebreak.scripts.runner.session import Log
+from makebreak.scripts.runner.settings import apply_settings
+from makebreak.scripts.runner.trials import setting_texts
 from makebreak.systems.contact_mpc.lcs_builder import AnitescuLcs
 from makebreak.systems.contact_mpc.numerics.lcs import simulate
 from makebreak.systems.contact_mpc.numerics.pivot_target import (

@@ -4,7 +4,7 @@ import pytest
 
 from makebreak.diagrams.cartpole_walls import CartpoleWallsConfig, make_cartpole_walls
 from makebreak.scripts.cli import main
-from makebreak.scripts.diagram_picture import (
+from makebreak.scripts.runner.diagram_picture import (
     columns,
     draw_diagram,
     shown_edges,

@@ -2,7 +2,7 @@
 
 import logging
 
-from makebreak.scripts.drake_log import DrakeLog
+from makebreak.scripts.cli.drake_log import DrakeLog
 
 IGNORED = "is currently unsupported and will be ignored."
 

@@ -15,11 +15,11 @@ from pydrake.systems.primitives import ConstantVectorSource
 from pydrake.systems.sensors import ImageRgba8U
 
 from makebreak.diagrams.cartpole_walls import CartpoleWallsConfig
-from makebreak.scripts import export_tests as export_module
 from makebreak.scripts.cli import main
 from makebreak.scripts.experiments import cartpole_walls
-from makebreak.scripts.export_tests import export_tests
-from makebreak.scripts.replay import (
+from makebreak.scripts.runner import export_tests as export_module
+from makebreak.scripts.runner.export_tests import export_tests
+from makebreak.scripts.runner.replay import (
     StoredTrack,
     Track,
     Unsupported,

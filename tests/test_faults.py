@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 import spring_mass
 
-from makebreak.scripts import arguments, cli, experiments
-from makebreak.scripts.faults import on_purpose
+from makebreak.scripts import experiments
+from makebreak.scripts.cli import arguments
+from makebreak.scripts.cli import commands as cli
+from makebreak.scripts.cli.faults import on_purpose
 
 
 @pytest.fixture(autouse=True)

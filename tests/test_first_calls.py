@@ -9,8 +9,8 @@ import pytest
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
-from makebreak.scripts import compile_ahead
-from makebreak.scripts.session import Session
+from makebreak.scripts.runner import compile_ahead
+from makebreak.scripts.runner.session import Session
 from makebreak.systems.numerics.first_calls import deferred, first_call
 
 
@@ -67,8 +67,8 @@ def test_a_session_compiles_before_it_simulates_and_only_once(tmp_path):
 
 def test_what_is_compiled_is_no_time_of_the_simulation(tmp_path, monkeypatch):
     now = [0.0]
-    monkeypatch.setattr("makebreak.scripts.session.perf_counter", lambda: now[0])
-    monkeypatch.setattr("makebreak.scripts.session.process_time", lambda: now[0])
+    monkeypatch.setattr("makebreak.scripts.runner.session.perf_counter", lambda: now[0])
+    monkeypatch.setattr("makebreak.scripts.runner.session.process_time", lambda: now[0])
 
     def compiles():
         now[0] += 100.0
@@ -126,6 +126,6 @@ def test_there_is_no_second_process_for_one_core(monkeypatch, tmp_path, cores, s
     assert len(commands) == started
     for command in commands:
         assert command[1:] == [
-            "-m", "makebreak.scripts.compile_ahead", "ball_rolling",
+            "-m", "makebreak.scripts.runner.compile_ahead", "ball_rolling",
             str(tmp_path / "config.yaml"),
         ]  # fmt: skip

@@ -11,7 +11,7 @@ from makebreak.gap.data.findings import JointFacts, SceneFacts
 from makebreak.gap.data.pieces import excerpt
 from makebreak.gap.data.reading import read_recording
 from makebreak.gap.data.table import write_recording
-from makebreak.scripts import cli
+from makebreak.scripts.cli import commands as cli
 
 Q, U, V = "p.j1.position", "p.j1.effort_command", "p.j1.velocity"
 

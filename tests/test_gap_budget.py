@@ -23,7 +23,8 @@ from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.workflow import run_gap
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import read_scene
-from makebreak.scripts import cli, interrupts
+from makebreak.scripts.cli import commands as cli
+from makebreak.scripts.runner import interrupts
 
 ROOT = Path(__file__).resolve().parent.parent
 URDF = """<robot name="arm"><link name="base"/><link name="l1"><inertial>

@@ -10,8 +10,8 @@ from types import ModuleType
 import pytest
 from test_gap_report import made_by_hand, small_case
 
-from makebreak.scripts import cli
-from makebreak.scripts.gap_command import StageBar, effects_table, known_sidecars
+from makebreak.scripts.cli import commands as cli
+from makebreak.scripts.cli.gap_command import StageBar, effects_table, known_sidecars
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +77,7 @@ def test_the_script_of_the_docs_writes_the_same_report(workflow, case, capsys):
 def test_every_verdict_is_a_run_that_is_done(workflow, case, verdict, monkeypatch):
     object.__setattr__(case[2], "verdict", verdict)
     monkeypatch.setattr(
-        "makebreak.scripts.gap_command.comparison_html", lambda *_: None
+        "makebreak.scripts.cli.gap_command.comparison_html", lambda *_: None
     )
     try:
         assert cli.main(["gap", str(case[0]), str(case[1]), "--out", "out"]) == 0

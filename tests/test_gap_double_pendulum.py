@@ -17,7 +17,7 @@ from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.simulation.judge import judge
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import read_scene
-from makebreak.scripts import cli
+from makebreak.scripts.cli import commands as cli
 
 FOLDER = Path(__file__).resolve().parents[2] / "shared/data"
 DATA = Path(os.environ.get("MAKEBREAK_DATA", FOLDER)) / "double_pendulum_A0.npz"

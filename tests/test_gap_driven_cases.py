@@ -21,11 +21,11 @@ from gap_benchmark.driven_cases import (  # noqa: E402
 from gap_benchmark.motions import Motion  # noqa: E402
 from gap_benchmark.robots import HARD  # noqa: E402
 
+from makebreak.benchmarks.gap_scoring import score  # noqa: E402
 from makebreak.gap.data.reading import check_against_scene, read_recording  # noqa: E402
 from makebreak.gap.data.scene_facts import scene_names  # noqa: E402
 from makebreak.models.dynamics import SceneDynamics  # noqa: E402
 from makebreak.models.scene import read_scene  # noqa: E402
-from makebreak.scripts.gap_scoring import score  # noqa: E402
 
 JOINTS = {"leg3": 3, "legs12": 12, "arm6": 6, "arm7": 7, "hand16": 16,
           "humanoid23": 23, "humanoid29": 29}  # fmt: skip

@@ -12,7 +12,7 @@ from makebreak.gap.simulation.windows import WindowModel
 from makebreak.gap.workflow import run_gap
 from makebreak.models.scene import InitialSection, read_scene
 from makebreak.models.scene_file import write_scene
-from makebreak.scripts.settings import one_line
+from makebreak.scripts.runner.settings import one_line
 
 N = 400
 

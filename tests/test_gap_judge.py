@@ -12,7 +12,7 @@ from makebreak.gap.data.table import write_recording
 from makebreak.gap.simulation.judge import judge
 from makebreak.models.scene import load_scene
 from makebreak.models.scene_file import write_scene
-from makebreak.scripts import cli
+from makebreak.scripts.cli import commands as cli
 
 PUSH = 1.2  # [rad/s2] of the measured joint, that the scene lacks.
 WINDOW = 0.5

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from makebreak.gap.parallel import side_by_side
-from makebreak.scripts.trials import run_environment
+from makebreak.scripts.runner.trials import run_environment
 
 
 @pytest.mark.parametrize("jobs", [1, 3])

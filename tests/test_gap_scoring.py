@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from makebreak.scripts import cli, gap_benchmark
-from makebreak.scripts.gap_scoring import (
+from makebreak.benchmarks import gap_benchmark
+from makebreak.benchmarks.gap_scoring import (
     LOGS,
     Score,
     parameter_errors,
@@ -17,6 +17,7 @@ from makebreak.scripts.gap_scoring import (
     score,
     table_of,
 )
+from makebreak.scripts.cli import commands as cli
 
 
 def truth(verdict="gap_named", effects=(), ties=()):
@@ -311,10 +312,14 @@ def made_by(maker, monkeypatch):
     monkeypatch.setattr(gap_benchmark, "SETS", every)
 
 
-def test_where_the_benchmark_is_absent_one_line_says_so(monkeypatch, capsys, tmp_path):
+@pytest.mark.parametrize("command", [["reproduce", "gap"], ["bench", "c3"]])
+def test_where_benchmarks_are_not_installed_one_line_says_so(
+    command, monkeypatch, capsys, tmp_path
+):
     monkeypatch.chdir(tmp_path)
-    made_by(tmp_path / "tests/cases.py", monkeypatch)
-    assert cli.main(["reproduce", "gap"]) == 2
+    for name in [n for n in sys.modules if n.startswith("makebreak.benchmarks")]:
+        monkeypatch.setitem(sys.modules, name, None)
+    assert cli.main(command) == 2
     shown = capsys.readouterr().err
     assert "is in a checkout of makebreak" in shown and shown.count("\n") == 1
 

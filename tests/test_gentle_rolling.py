@@ -30,8 +30,8 @@ from makebreak.diagrams.gentle_rolling import (
 )
 from makebreak.scripts.cli import main
 from makebreak.scripts.experiments import gentle_rolling as experiment
-from makebreak.scripts.export_tests import export_tests
-from makebreak.scripts.rolling_score import progress_of, true_arm
+from makebreak.scripts.experiments.papers.rolling_score import progress_of, true_arm
+from makebreak.scripts.runner.export_tests import export_tests
 from makebreak.systems.arm import impedance_controller
 from makebreak.systems.arm.numerics.serial_chain import tip_kinematics
 from makebreak.systems.baselines.frozen import Frozen

@@ -26,10 +26,10 @@ from makebreak.diagrams.station import make_control_plant
 from makebreak.diagrams.tabletop import TABLETOP_WALLS, TOOL, read_model
 from makebreak.gap.data.table import write_recording
 from makebreak.models.scene import read_scene
-from makebreak.scripts import cli
+from makebreak.scripts.cli import commands as cli
 from makebreak.scripts.experiments import changing_surface
-from makebreak.scripts.pattern_file import read_pattern
-from makebreak.scripts.pattern_runs import scored, summary
+from makebreak.scripts.experiments.runs.pattern_file import read_pattern
+from makebreak.scripts.experiments.runs.pattern_runs import scored, summary
 from makebreak.systems.changing_contact.numerics.contact_task import (
     CONTACT_MISSING,
     DIRECTION,

@@ -1,7 +1,7 @@
 """The verdict on each hypothesis follows from the targets that its tables meet."""
 
-from makebreak.scripts.hypotheses import HYPOTHESES, verdicts
-from makebreak.scripts.table import Table
+from makebreak.scripts.experiments.papers.hypotheses import HYPOTHESES, verdicts
+from makebreak.scripts.runner.table import Table
 
 COLUMNS = ("what", "paper", "ours", "command")
 

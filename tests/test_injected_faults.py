@@ -15,6 +15,14 @@ from pydrake.systems.primitives import TrajectorySource, ZeroOrderHold
 from pydrake.systems.sensors import ImageRgba8U
 from pydrake.trajectories import PiecewisePolynomial
 
+from makebreak.benchmarks.fault_trials import (
+    FAILED,
+    HELD,
+    RECOVERED,
+    UNJUDGED,
+    at_rest,
+    judge,
+)
 from makebreak.diagrams.ball_rolling import make_ball_rolling, make_world
 from makebreak.diagrams.ball_rolling_config import BallRollingConfig
 from makebreak.diagrams.camera import CameraConfig, camera_model
@@ -34,19 +42,11 @@ from makebreak.diagrams.station import (
     make_station,
 )
 from makebreak.diagrams.wall_friction import WallFrictionConfig, make_wall_friction
-from makebreak.scripts import cli
-from makebreak.scripts.command_inputs import with_faults
-from makebreak.scripts.contact_runs import rehearsed
-from makebreak.scripts.fault_trials import (
-    FAILED,
-    HELD,
-    RECOVERED,
-    UNJUDGED,
-    at_rest,
-    judge,
-)
-from makebreak.scripts.rolling_score import Track, speed_at_the_end
-from makebreak.scripts.session import Session
+from makebreak.scripts.cli import commands as cli
+from makebreak.scripts.cli.command_inputs import with_faults
+from makebreak.scripts.experiments.papers.rolling_score import Track, speed_at_the_end
+from makebreak.scripts.experiments.runs.contact_runs import rehearsed
+from makebreak.scripts.runner.session import Session
 from makebreak.systems.arm.impedance_controller import (
     ImpedanceConfig,
     ImpedanceController,

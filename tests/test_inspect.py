@@ -8,8 +8,8 @@ import yaml
 from front_doors import exact
 
 from makebreak.scripts.cli import main
-from makebreak.scripts.gap_command import known_sidecars
-from makebreak.scripts.outputs import OutputFolder
+from makebreak.scripts.cli.gap_command import known_sidecars
+from makebreak.scripts.runner.outputs import OutputFolder
 
 SIDECAR = """columns:
   a: {channel: arm.joint1.position, scale: 0.5}

@@ -26,10 +26,10 @@ from makebreak.diagrams.lcm_station import (
 from makebreak.diagrams.replay_station import joint_columns, make_replay_station
 from makebreak.diagrams.scene_facts import N_JOINTS
 from makebreak.diagrams.station import make_control_plant
-from makebreak.scripts import cli
+from makebreak.scripts.cli import commands as cli
 from makebreak.scripts.experiments.ball_rolling import differences, start_where_it_is
-from makebreak.scripts.lcm_loop import HOLD_SEC, SPIN_MS, LcmLoop
-from makebreak.scripts.stand_in import (
+from makebreak.scripts.runner.lcm_loop import HOLD_SEC, SPIN_MS, LcmLoop
+from makebreak.scripts.runner.stand_in import (
     DAMPING,
     EXPIRE_SEC,
     Driver,

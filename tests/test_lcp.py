@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from pydrake.solvers import MathematicalProgram, MobyLcpSolver
 from scipy.optimize import linprog
 
-from makebreak.scripts.bench_plants import OF_MASS, diagram_of
+from makebreak.benchmarks.plants import OF_MASS, diagram_of
 from makebreak.systems.contact_mpc.lcs_builder import AnitescuLcs
 from makebreak.systems.contact_mpc.numerics.lcp import (
     SOLVED,

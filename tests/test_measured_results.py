@@ -14,7 +14,7 @@ from measured_results import (
     with_tables,
 )
 
-from makebreak.scripts.table import Table
+from makebreak.scripts.runner.table import Table
 
 PAGE = Path(__file__).parent.parent / "docs/results.md"
 

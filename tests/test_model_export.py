@@ -16,7 +16,7 @@ from makebreak.models.effects.kind import Effect
 from makebreak.models.model_export import to_mjcf, to_urdf
 from makebreak.models.scene import ActuationSection, load_scene
 from makebreak.models.scene_schema import SupplySection
-from makebreak.scripts.gap_command import exported
+from makebreak.scripts.cli.gap_command import exported
 
 JOINTS = ("d.j1", "d.j2")
 SAID = (

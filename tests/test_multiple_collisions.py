@@ -28,8 +28,8 @@ from makebreak.scripts.experiments.multiple_collisions import (
     scored,
     summary,
 )
-from makebreak.scripts.session import Session
-from makebreak.scripts.settings import apply_settings
+from makebreak.scripts.runner.session import Session
+from makebreak.scripts.runner.settings import apply_settings
 from makebreak.systems.changing_contact.numerics.contact_task import (
     BROKEN,
     DIRECTION,

@@ -14,8 +14,10 @@ import pytest
 import spring_mass
 from test_gap_report import made_by_hand, small_case
 
-from makebreak.scripts import cli, experiments, trials
-from makebreak.scripts.outputs import MARK, STAGE, OutputFolder
+from makebreak.scripts import experiments
+from makebreak.scripts.cli import commands as cli
+from makebreak.scripts.runner import trials
+from makebreak.scripts.runner.outputs import MARK, STAGE, OutputFolder
 
 
 @pytest.fixture(autouse=True)

@@ -54,7 +54,7 @@ def archives(tmp_path_factory):
     """The folder of a checkout's copy; its sdist; the wheel that is built from that."""
     out, copy = tmp_path_factory.mktemp("dist"), tmp_path_factory.mktemp("of") / "copy"
     ignore = shutil.ignore_patterns("__pycache__")
-    for name in ("makebreak", *ROOMS, "docs", "examples"):
+    for name in ("makebreak", *ROOMS, "benchmarks", "docs", "examples"):
         shutil.copytree(ROOT / name, copy / name, symlinks=True, ignore=ignore)
     for each in ROOT.iterdir():
         if each.is_file() and not each.name.startswith("."):

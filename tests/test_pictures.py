@@ -7,15 +7,15 @@ from types import SimpleNamespace
 
 import pytest
 
-from makebreak.scripts import pictures
-from makebreak.scripts.outputs import STAGE
-from makebreak.scripts.pictures import (
+from makebreak.benchmarks import pictures
+from makebreak.benchmarks.pictures import (
     DOCS,
     PICTURES,
     PLOTS,
     _last_time,
     make_pictures,
 )
+from makebreak.scripts.runner.outputs import STAGE
 
 
 def test_every_picture_of_the_documents_is_there_and_made_by_the_command():

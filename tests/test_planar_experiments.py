@@ -12,12 +12,13 @@ from makebreak.diagrams.multi_spring import MultiSpringConfig
 from makebreak.diagrams.planar import knowledge_of
 from makebreak.diagrams.planar_tuned import SETTINGS, TUNED_FILE, tuned_biomimetic
 from makebreak.diagrams.porridge import PorridgeConfig
-from makebreak.scripts import comparison, tune_planar
-from makebreak.scripts import planar_loops as loops
 from makebreak.scripts.cli import main
 from makebreak.scripts.experiments import multi_spring, porridge
-from makebreak.scripts.planar_runs import median_range, with_count
-from makebreak.scripts.session import Session
+from makebreak.scripts.experiments.papers import planar_loops as loops
+from makebreak.scripts.experiments.papers import tune_planar
+from makebreak.scripts.experiments.runs.planar_runs import median_range, with_count
+from makebreak.scripts.runner import comparison
+from makebreak.scripts.runner.session import Session
 from makebreak.systems.baselines.numerics.mrac import error_weights
 from makebreak.systems.planar.numerics.planar_impedance import persistence
 from makebreak.systems.planar.numerics.planar_world import compensated

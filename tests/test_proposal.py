@@ -17,7 +17,7 @@ from makebreak.gap.simulation.scene_simulation import SceneSimulation
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.scene import load_scene, read_scene
 from makebreak.scripts.cli import main
-from makebreak.scripts.gap_command import name_from
+from makebreak.scripts.cli.gap_command import name_from
 
 T = np.arange(400) * 0.01
 PANDA = [JointName(f"panda.panda_joint{k}", lower=-2.9, upper=2.9) for k in range(1, 8)]

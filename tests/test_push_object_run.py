@@ -36,8 +36,8 @@ from makebreak.scripts.experiments.push_object import (
     totals,
     won_back,
 )
-from makebreak.scripts.session import Session
-from makebreak.scripts.settings import apply_settings
+from makebreak.scripts.runner.session import Session
+from makebreak.scripts.runner.settings import apply_settings
 from makebreak.systems.perception.numerics.past_state import pose_at
 from makebreak.systems.perception.pose_sensor import KEPT_SEC, PoseSensorConfig
 

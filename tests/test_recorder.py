@@ -27,7 +27,7 @@ from makebreak.gap.data.reading import check_against_scene, read_recordings
 from makebreak.gap.data.scene_facts import scene_names
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.scene import read_scene
-from makebreak.scripts.session import MODEL, Session
+from makebreak.scripts.runner.session import MODEL, Session
 
 
 def ramp(slope: float) -> TrajectorySource:

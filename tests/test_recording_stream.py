@@ -11,8 +11,8 @@ import pytest
 
 from makebreak.diagrams.recorder import add_recorder, recorded
 from makebreak.gap.data.reading import read_recording
-from makebreak.scripts import recording_stream
-from makebreak.scripts.session import Session
+from makebreak.scripts.runner import recording_stream
+from makebreak.scripts.runner.session import Session
 
 # A pendulum with a recorder, simulated in real time for a minute.
 RUN = """
@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 import pydrake.all as drake
 from makebreak.diagrams.recorder import add_recorder
-from makebreak.scripts.session import Session
+from makebreak.scripts.runner.session import Session
 
 def pendulum():
     builder = drake.DiagramBuilder()
@@ -91,7 +91,7 @@ from pathlib import Path
 from time import monotonic
 from makebreak.diagrams.ball_rolling import BallRollingConfig, make_ball_rolling
 from makebreak.diagrams.camera import CameraConfig
-from makebreak.scripts.session import Session
+from makebreak.scripts.runner.session import Session
 
 def say(t, sample):
     os.write(1, f"{monotonic()!r} {t!r}\\n".encode())

@@ -4,8 +4,12 @@ from types import SimpleNamespace
 
 import pytest
 
-from makebreak.scripts import rolling_paper
-from makebreak.scripts.rolling_paper import conditions, no_worse, reproduce
+from makebreak.scripts.experiments.papers import rolling_paper
+from makebreak.scripts.experiments.papers.rolling_paper import (
+    conditions,
+    no_worse,
+    reproduce,
+)
 
 SEEDS = 20
 GOOD = {

@@ -11,9 +11,10 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, Integrator
 
-from makebreak.scripts import run_buttons, run_command
-from makebreak.scripts.run_buttons import OVER, PAUSE, STOP
-from makebreak.scripts.session import Session
+from makebreak.scripts.cli import run_command
+from makebreak.scripts.runner import run_buttons
+from makebreak.scripts.runner.run_buttons import OVER, PAUSE, STOP
+from makebreak.scripts.runner.session import Session
 
 
 def press(meshcat, name):

@@ -18,7 +18,7 @@ from makebreak.models.scene import (
     set_initial_velocities,
 )
 from makebreak.models.typed_yaml import nearest
-from makebreak.scripts.session import Session
+from makebreak.scripts.runner.session import Session
 
 G = 9.81
 RADIUS, MASS = 0.0315, 0.07

@@ -15,9 +15,9 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
 
-from makebreak.scripts.browser import BROWSERS, Browser
-from makebreak.scripts.meshcat_page import OPEN_CONTROLS, page_of
-from makebreak.scripts.screenshot import screenshot
+from makebreak.scripts.runner.browser import BROWSERS, Browser
+from makebreak.scripts.runner.meshcat_page import OPEN_CONTROLS, page_of
+from makebreak.scripts.runner.screenshot import screenshot
 from makebreak.systems.views.contact_view import FORCE_SLIDER, SPEED_SLIDER
 from makebreak.systems.views.legend import Legend, LegendConfig
 from makebreak.systems.views.model_sliders import FRICTION, GAP

@@ -21,16 +21,16 @@ from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource, Integrator
 
 from makebreak.gap.data.table import check_columns, write_recording
-from makebreak.scripts.compiling import FIRST, CompilingShown
-from makebreak.scripts.run_buttons import RunButtons
-from makebreak.scripts.session import Session
-from makebreak.scripts.settings import (
+from makebreak.scripts.runner.compiling import FIRST, CompilingShown
+from makebreak.scripts.runner.run_buttons import RunButtons
+from makebreak.scripts.runner.session import Session
+from makebreak.scripts.runner.settings import (
     apply_settings,
     convert,
     dump_config,
     load_config,
 )
-from makebreak.scripts.table import Table
+from makebreak.scripts.runner.table import Table
 from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.timing import timed
 from makebreak.systems.views.legend import Legend, LegendConfig

@@ -5,14 +5,14 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from makebreak.scripts import cli
-from makebreak.scripts.experiments import EXPERIMENTS, load_experiment
-from makebreak.scripts.settings import apply_settings, field_types, to_plain
-from makebreak.scripts.settings_list import (
+from makebreak.scripts.cli import commands as cli
+from makebreak.scripts.cli.settings_list import (
     comments_of,
     settings_rows,
     settings_text,
 )
+from makebreak.scripts.experiments import EXPERIMENTS, load_experiment
+from makebreak.scripts.runner.settings import apply_settings, field_types, to_plain
 
 
 @dataclass

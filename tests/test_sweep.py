@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 import spring_mass
 
-from makebreak.scripts import cli, trials
+from makebreak.scripts.cli import commands as cli
 from makebreak.scripts.experiments import EXPERIMENTS
-from makebreak.scripts.settings import apply_settings
-from makebreak.scripts.sweep import Sweep, _plot, run_sweep, wilson
+from makebreak.scripts.runner import trials
+from makebreak.scripts.runner.settings import apply_settings
+from makebreak.scripts.runner.sweep import Sweep, _plot, run_sweep, wilson
 
 
 @pytest.fixture(autouse=True)
@@ -149,11 +150,11 @@ sys.exit(main())
 
 SLOW = """
 import time
-from makebreak.scripts import trials
+from makebreak.scripts.runner import trials
 trials._COMMAND = {command!r}
 import spring_mass
 from pathlib import Path
-from makebreak.scripts.sweep import Sweep, run_sweep
+from makebreak.scripts.runner.sweep import Sweep, run_sweep
 config = spring_mass.Config(steps=800)
 run_sweep(Sweep("spring_mass", config, ["noise=0.0:0.1"], 2), Path({out!r}), 1)
 """

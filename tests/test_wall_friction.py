@@ -25,22 +25,22 @@ from makebreak.diagrams.wall_friction import (
     tip_states,
 )
 from makebreak.scripts.experiments import wall_friction
-from makebreak.scripts.experiments.wall_friction import (
-    force_trial,
-    run,
-    simulated,
-    tracking_error,
-)
-from makebreak.scripts.session import Session
-from makebreak.scripts.settings import apply_settings
-from makebreak.scripts.wall_friction_paper import _loop_rows
-from makebreak.scripts.wall_friction_score import (
+from makebreak.scripts.experiments.papers.wall_friction_paper import _loop_rows
+from makebreak.scripts.experiments.papers.wall_friction_score import (
     FED,
     along_the_wall,
     contact_time,
     share_in_band,
     without_noise,
 )
+from makebreak.scripts.experiments.wall_friction import (
+    force_trial,
+    run,
+    simulated,
+    tracking_error,
+)
+from makebreak.scripts.runner.session import Session
+from makebreak.scripts.runner.settings import apply_settings
 from makebreak.systems.baselines.long_term_predictor import OneStepPredictor
 from makebreak.systems.baselines.numerics.long_term_predictor import (
     LongTermPredictor,

@@ -17,10 +17,8 @@ from makebreak.diagrams.recorder import recorded
 from makebreak.diagrams.replay_station import joint_columns, make_replay_station
 from makebreak.diagrams.station import TIP_FRAME, TORQUE_RATE_MAX, make_control_plant
 from makebreak.gap.data.table import read_table
-from makebreak.scripts import rolling_paper
-from makebreak.scripts.criteria import Criteria
-from makebreak.scripts.lcm_loop import drive
-from makebreak.scripts.rolling_score import (
+from makebreak.scripts.experiments.papers import rolling_paper
+from makebreak.scripts.experiments.papers.rolling_score import (
     CIRCLES,
     DURATION_SEC,
     ERROR_MAX,
@@ -36,6 +34,8 @@ from makebreak.scripts.rolling_score import (
     speed_at_the_end,
     write_recording,
 )
+from makebreak.scripts.runner.criteria import Criteria
+from makebreak.scripts.runner.lcm_loop import drive
 from makebreak.systems.contact_mpc.numerics.ball_state import P_BALL
 
 SUMMARY = "a Panda rolls a ball around a circle with a wrong model (ACI-MPC VII-B)"

@@ -34,10 +34,10 @@ from makebreak.diagrams.cartpole_walls import (
 )
 from makebreak.diagrams.recorder import recorded, with_noise
 from makebreak.models.scene import read_scene
-from makebreak.scripts.comparison import Comparison
-from makebreak.scripts.criteria import Criteria
-from makebreak.scripts.session import Log, Session
-from makebreak.scripts.table import Table
+from makebreak.scripts.runner.comparison import Comparison
+from makebreak.scripts.runner.criteria import Criteria
+from makebreak.scripts.runner.session import Log, Session
+from makebreak.scripts.runner.table import Table
 from makebreak.systems.contact_mpc.numerics.lcp import solve_lcp
 from makebreak.systems.contact_mpc.numerics.lcs import simulate
 from makebreak.systems.contact_mpc.numerics.residual_learner import (

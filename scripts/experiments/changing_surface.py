@@ -36,12 +36,12 @@ from makebreak.diagrams.changing_surface import (
 from makebreak.diagrams.given_pattern import segment_paths
 from makebreak.diagrams.recorder import recorded
 from makebreak.diagrams.tabletop import THREE_SURFACES, read_model
-from makebreak.scripts.comparison import Comparison
-from makebreak.scripts.contact_runs import rehearsed, simulate_motion
-from makebreak.scripts.criteria import Criteria
-from makebreak.scripts.pattern_file import read_pattern
-from makebreak.scripts.session import Session
-from makebreak.scripts.table import Table
+from makebreak.scripts.experiments.runs.contact_runs import rehearsed, simulate_motion
+from makebreak.scripts.experiments.runs.pattern_file import read_pattern
+from makebreak.scripts.runner.comparison import Comparison
+from makebreak.scripts.runner.criteria import Criteria
+from makebreak.scripts.runner.session import Session
+from makebreak.scripts.runner.table import Table
 from makebreak.systems.changing_contact.numerics.contact_task import (
     CHANGE_TIME,
     COUNT,

@@ -36,11 +36,11 @@ from makebreak.diagrams.contact_learning import (
 )
 from makebreak.diagrams.recorder import episodes, recorded
 from makebreak.diagrams.tabletop import position
-from makebreak.scripts.comparison import Comparison
-from makebreak.scripts.contact_runs import rehearsed, simulate_motion
-from makebreak.scripts.criteria import Criteria
-from makebreak.scripts.session import Session
-from makebreak.scripts.table import Table
+from makebreak.scripts.experiments.runs.contact_runs import rehearsed, simulate_motion
+from makebreak.scripts.runner.comparison import Comparison
+from makebreak.scripts.runner.criteria import Criteria
+from makebreak.scripts.runner.session import Session
+from makebreak.scripts.runner.table import Table
 from makebreak.systems.changing_contact.numerics.contact_anticipator import spread_along
 from makebreak.systems.changing_contact.numerics.contact_task import (
     DIRECTION,

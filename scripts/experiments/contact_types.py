@@ -25,11 +25,11 @@ from makebreak.diagrams.contact_types import (
     make_task,
 )
 from makebreak.diagrams.recorder import recorded
-from makebreak.scripts.comparison import Comparison
-from makebreak.scripts.contact_runs import simulate_motion
-from makebreak.scripts.criteria import Criteria
-from makebreak.scripts.session import Session
-from makebreak.scripts.table import Table
+from makebreak.scripts.experiments.runs.contact_runs import simulate_motion
+from makebreak.scripts.runner.comparison import Comparison
+from makebreak.scripts.runner.criteria import Criteria
+from makebreak.scripts.runner.session import Session
+from makebreak.scripts.runner.table import Table
 from makebreak.systems.changing_contact.numerics.contact_task import (
     DONE,
     PHASE_SEGMENT,

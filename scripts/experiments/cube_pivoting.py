@@ -28,11 +28,11 @@ from makebreak.diagrams.cube_pivoting_config import (
     world_cube,
 )
 from makebreak.diagrams.recorder import recorded, with_noise
-from makebreak.scripts.comparison import Comparison
-from makebreak.scripts.criteria import Criteria
-from makebreak.scripts.session import Log, Session
-from makebreak.scripts.sweep import rate_text
-from makebreak.scripts.table import Table
+from makebreak.scripts.runner.comparison import Comparison
+from makebreak.scripts.runner.criteria import Criteria
+from makebreak.scripts.runner.session import Log, Session
+from makebreak.scripts.runner.sweep import rate_text
+from makebreak.scripts.runner.table import Table
 from makebreak.systems.contact_mpc.c3_mpc import C3Status
 from makebreak.systems.contact_mpc.numerics.pivot_target import (
     LEFT,

@@ -25,11 +25,11 @@ from makebreak.diagrams.gentle_rolling import (
 from makebreak.diagrams.scene_facts import sphere_radius
 from makebreak.diagrams.station import ARM, TOOL
 from makebreak.models.scene import load_scene
-from makebreak.scripts import rolling_score
-from makebreak.scripts.comparison import Rows
 from makebreak.scripts.experiments import ball_rolling as rolling
-from makebreak.scripts.table import Table
-from makebreak.scripts.trials import run_many
+from makebreak.scripts.experiments.papers import rolling_score
+from makebreak.scripts.runner.comparison import Rows
+from makebreak.scripts.runner.table import Table
+from makebreak.scripts.runner.trials import run_many
 from makebreak.systems.arm.numerics.contact_force import contact_forces
 from makebreak.systems.arm.numerics.serial_chain import tip_kinematics
 from makebreak.systems.changing_contact.numerics.contact_task import (

@@ -4,7 +4,7 @@ active inference and biomimetic control. CC 4.2, figures 5 to 7.
 Every controller moves the same effector (1 kg, |u| <= 100 N, 1 kHz) around the same
 circle (radius 0.25 m, 6 s, from rest to rest). The seed draws the start of the circle,
 its direction, stiffness and distance of each spring within 20 %, and the sensors'
-noise. All are tuned on seeds 100 to 113 in wide ranges: scripts/tune_planar.py,
+noise. All are tuned on seeds 100 to 113 in wide ranges: papers/tune_planar.py,
 docs/planar.md. As the adaptive controller has a force sensor in its law, the others are
 run with feedforward of the measured force, and without.
 
@@ -49,10 +49,8 @@ from makebreak.diagrams.planar_tuned import (
     tuned_impedance,
     tuned_mrac,
 )
-from makebreak.scripts.comparison import Comparison
-from makebreak.scripts.criteria import Criteria
-from makebreak.scripts.planar_comparison import compare
-from makebreak.scripts.planar_runs import (
+from makebreak.scripts.experiments.papers.planar_comparison import compare
+from makebreak.scripts.experiments.runs.planar_runs import (
     error_rms,
     errors,
     limit_share,
@@ -63,8 +61,10 @@ from makebreak.scripts.planar_runs import (
     with_count,
     write_recording,
 )
-from makebreak.scripts.session import Log, Session
-from makebreak.scripts.table import Table
+from makebreak.scripts.runner.comparison import Comparison
+from makebreak.scripts.runner.criteria import Criteria
+from makebreak.scripts.runner.session import Log, Session
+from makebreak.scripts.runner.table import Table
 from makebreak.systems.baselines.mrac import MracConfig
 from makebreak.systems.planar.numerics.planar_impedance import persistence
 

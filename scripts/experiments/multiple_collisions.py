@@ -35,12 +35,12 @@ from makebreak.diagrams.multiple_collisions import (
 )
 from makebreak.diagrams.station import TORQUE_RATE_MAX, make_control_plant
 from makebreak.diagrams.tabletop import TOOL, position
-from makebreak.scripts.collision_trials import run_trials
-from makebreak.scripts.comparison import Comparison
-from makebreak.scripts.criteria import Criteria
-from makebreak.scripts.pattern_runs import follow_pattern
-from makebreak.scripts.session import Session
-from makebreak.scripts.table import Table
+from makebreak.scripts.experiments.runs.collision_trials import run_trials
+from makebreak.scripts.experiments.runs.pattern_runs import follow_pattern
+from makebreak.scripts.runner.comparison import Comparison
+from makebreak.scripts.runner.criteria import Criteria
+from makebreak.scripts.runner.session import Session
+from makebreak.scripts.runner.table import Table
 from makebreak.systems.changing_contact.numerics.contact_task import (
     BROKEN,
     DIRECTION,

@@ -30,9 +30,7 @@ import numpy as np
 from makebreak.diagrams.multi_spring import impedance, mrac
 from makebreak.diagrams.planar import PlanarSensing, knowledge_of
 from makebreak.diagrams.porridge import PorridgeConfig, draw, make_porridge
-from makebreak.scripts.comparison import Comparison
-from makebreak.scripts.criteria import Criteria
-from makebreak.scripts.planar_runs import (
+from makebreak.scripts.experiments.runs.planar_runs import (
     along_motion,
     error_rms,
     errors,
@@ -43,8 +41,10 @@ from makebreak.scripts.planar_runs import (
     with_count,
     write_recording,
 )
-from makebreak.scripts.session import Log, Session
-from makebreak.scripts.table import Table
+from makebreak.scripts.runner.comparison import Comparison
+from makebreak.scripts.runner.criteria import Criteria
+from makebreak.scripts.runner.session import Log, Session
+from makebreak.scripts.runner.table import Table
 from makebreak.systems.baselines.numerics.fixed_gmm import fit_mixture
 from makebreak.systems.changing_contact.numerics.igmm import regress
 from makebreak.systems.planar.numerics.planar_impedance import features_of, persistence

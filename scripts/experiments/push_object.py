@@ -27,11 +27,11 @@ from makebreak.diagrams.recorder import recorded
 from makebreak.diagrams.scene_facts import actuators_of
 from makebreak.diagrams.station import ARM, TIP_FRAME, TORQUE_RATE_MAX
 from makebreak.models.pushed_object import hull_obj, object_sdf, parts, rest_height
-from makebreak.scripts.comparison import Rows
-from makebreak.scripts.criteria import Criteria
-from makebreak.scripts.sweep import rate_text
-from makebreak.scripts.table import Table
-from makebreak.scripts.trials import run_many
+from makebreak.scripts.runner.comparison import Rows
+from makebreak.scripts.runner.criteria import Criteria
+from makebreak.scripts.runner.sweep import rate_text
+from makebreak.scripts.runner.table import Table
+from makebreak.scripts.runner.trials import run_many
 from makebreak.systems.contact_mpc.numerics.push_task import WAIT
 from makebreak.systems.perception.numerics.pose_filter import on_the_table
 

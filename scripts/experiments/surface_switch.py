@@ -38,11 +38,11 @@ from makebreak.diagrams.surface_switch import (
     make_surface_switch,
     make_task,
 )
-from makebreak.scripts.comparison import Comparison
-from makebreak.scripts.contact_runs import rehearsed, simulate_motion
-from makebreak.scripts.criteria import Criteria
-from makebreak.scripts.session import Session
-from makebreak.scripts.table import Table
+from makebreak.scripts.experiments.runs.contact_runs import rehearsed, simulate_motion
+from makebreak.scripts.runner.comparison import Comparison
+from makebreak.scripts.runner.criteria import Criteria
+from makebreak.scripts.runner.session import Session
+from makebreak.scripts.runner.table import Table
 from makebreak.systems.changing_contact.numerics.contact_task import (
     CHANGE_TIME,
     COUNT,

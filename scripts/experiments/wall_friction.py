@@ -43,11 +43,12 @@ from makebreak.diagrams.wall_friction import (
 )
 from makebreak.diagrams.wiring import refuse_unused
 from makebreak.models.scene import read_scene
-from makebreak.scripts import wall_friction_paper
-from makebreak.scripts.criteria import Criteria
-from makebreak.scripts.session import Session
-from makebreak.scripts.wall_friction_plots import plot_forces, plot_joints
-from makebreak.scripts.wall_friction_score import (
+from makebreak.scripts.experiments.papers import wall_friction_paper
+from makebreak.scripts.experiments.papers.wall_friction_plots import (
+    plot_forces,
+    plot_joints,
+)
+from makebreak.scripts.experiments.papers.wall_friction_score import (
     EACH_FILE,
     ONE_STEP,
     SETS,
@@ -59,6 +60,8 @@ from makebreak.scripts.wall_friction_score import (
     rms,
     share_in_band,
 )
+from makebreak.scripts.runner.criteria import Criteria
+from makebreak.scripts.runner.session import Session
 from makebreak.systems.baselines.numerics.long_term_predictor import (
     LongTermPredictor,
     Prediction,

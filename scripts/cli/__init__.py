@@ -1,0 +1,3 @@
+"""The command line: reads what was typed, and prints."""
+
+from makebreak.scripts.cli.commands import main as main

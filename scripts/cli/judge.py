@@ -1,0 +1,51 @@
+"""`makebreak judge`: prediction error of scenes on recordings, channel by channel.
+
+Each recording is cut into windows that start from measured states, which each scene
+simulates with the recorded commands. To evaluate a repair, give the original scene, the
+one that `makebreak gap` wrote, and recordings that were not given to `makebreak gap`.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from makebreak.gap.data.reading import read_recordings
+from makebreak.gap.data.sidecar import has_sidecar
+from makebreak.gap.simulation.judge import judge
+from makebreak.models.scene import read_scene
+from makebreak.scripts.cli.gap_command import sidecar_near
+from makebreak.scripts.runner.table import Table
+
+
+def judge_scenes(
+    scenes: Sequence[str], recordings: Sequence[Path], window_sec: float
+) -> Table:
+    """A row for each channel, a column for each scene. A recording without a sidecar of
+    its own is read as the one beside the first scene says, as by `makebreak gap`.
+
+    Raises: ValueError for scenes and recordings that cannot be used.
+    """
+    found = {
+        p: sidecar_near(Path(scenes[0]), p) for p in recordings if not has_sidecar(p)
+    }
+    sidecars = {p: near for p, near in found.items() if near is not None}
+    tables = read_recordings(recordings, sidecars=sidecars)
+    judged = [judge(read_scene(path), tables, window_sec) for path in scenes]
+    first = judged[0]
+    rows: list[tuple] = []
+    for k, each in enumerate(first):
+        for where, name in ((f"{window_sec:g} s ahead", "at_end"), ("all", "rms")):
+            errors = [getattr(of[k], name) for of in judged]
+            rows.append((each.channel, each.unit, where, *errors, each.noise))
+    notes = [
+        f"{first[0].n_windows} windows of {window_sec:g} s of {len(tables)} "
+        f"recording{'s' if len(tables) > 1 else ''}; rms of measured - simulated "
+        f"{window_sec:g} s ahead (the last sample of each window), and over all their "
+        "samples."
+    ]
+    for path, of in zip(scenes, judged, strict=True):
+        if of[0].failed:
+            notes.append(f"{path}: {of[0].failed:.1%} of the windows did not finish.")
+    return Table(
+        "Error in windows from measured states",
+        ("channel", "unit", "of", *scenes, "noise"), rows, notes=notes,
+    )  # fmt: skip
