@@ -277,6 +277,11 @@ def _quantity(name: str, named: Sequence[JointName]) -> str | None:
     return f"{kind}_command" if command else kind
 
 
+def says_quantity(word: str) -> bool:
+    """Whether a word tells what a column is, or that it is a command."""
+    return word in _COMMAND or any(word in own for own in _WORDS.values())
+
+
 def _words_in(joints: Sequence[JointName]) -> set[str]:
     """Of the names of joints."""
     return {w for joint in joints for w in words_of(joint.name.split(".", 1)[1])}

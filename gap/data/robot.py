@@ -782,11 +782,20 @@ def _motions(robot: Robot, every, logs) -> list[ServoLog]:
         time = channels["time"]
         q = np.stack([channels[f"{j.name}.position"] for j in robot.joints], axis=1)
         none = np.full(len(time), np.nan)
-        told = [channels.get(f"{j.name}.position_command", none) for j in robot.joints]
+        told = [
+            _held(channels.get(f"{j.name}.position_command", none))
+            for j in robot.joints
+        ]
         good = np.isfinite(q).all(axis=1) & np.isfinite(time)
         good &= np.diff(time, prepend=-np.inf) > 0.0
         motions.append(ServoLog(time[good], q[good], np.stack(told, axis=1)[good]))
     return motions
+
+
+def _held(y: np.ndarray) -> np.ndarray:
+    """A command (n,) that may be on rows of its own, until the next one."""
+    last = np.maximum.accumulate(np.where(np.isfinite(y), np.arange(len(y)), -1))
+    return np.where(last < 0, np.nan, y[last])
 
 
 def _gains_by_motion(robot: Robot, every, logs) -> dict[str, ServoGains]:

@@ -126,7 +126,7 @@ def run_and_report(
     seconds = 60.0 * budget_min
     with OutputFolder(out_dir, "gap", inputs) as out:
         if is_robot:
-            scene_path, sidecars, notes, doubts = _proposed(
+            scene_path, recording_paths, sidecars, notes, doubts = _proposed(
                 scene_path, recording_paths, out, out_dir, sidecar
             )
             print_files(out.keep(), sys.stderr)
@@ -237,18 +237,19 @@ def _proposed(
     out: OutputFolder,
     out_dir: Path,
     sidecar: Path | None,
-) -> tuple[Path, dict[Path, Path], list[str], list[Finding]]:
+) -> tuple[Path, list[Path], dict[Path, Path], list[str], list[Finding]]:
     """Writes a proposed scene and sidecars for a robot and its logs.
 
-    Returns: the scene's path, {recording: sidecar}, notes for the user, and what the
-    result must not forget of them.
+    Returns: the scene's path; the recordings, of files that are one log the first;
+    {recording: sidecar}; notes for the user; what the result must not forget of them.
     """
-    from makebreak.gap.data.robot import propose_scene, read_log, read_robot
+    from makebreak.gap.data.gathered import read_logs
+    from makebreak.gap.data.robot import propose_scene, read_robot
 
     robot = read_robot(robot_path)
-    proposal = propose_scene(
-        robot, [read_log(path, sidecar) for path in recording_paths]
-    )
+    logs = read_logs(recording_paths, robot, sidecar)
+    recording_paths = [log.path for log in logs]
+    proposal = propose_scene(robot, logs)
     scene = out.file("proposed_scene.yaml")
     scene.write_text(proposal.scene)
     for name, text in proposal.copies.items():
@@ -273,7 +274,7 @@ def _proposed(
     doubts = proposal.findings()
     notes += [finding.says for finding in doubts if finding.kind == NO_COLUMN]
     notes += [each.says for each in proposal.said]
-    return scene, sidecars, notes, doubts
+    return scene, recording_paths, sidecars, notes, doubts
 
 
 def name_from(folder: Path, robot: Path, proposed_scene: Path) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from makebreak.gap.data.bags import is_bag, is_dataset
+from makebreak.gap.data.gathered import gathered
 from makebreak.gap.data.proposal import Match, sidecar_text
 from makebreak.gap.data.recording_files import ROBOTS, recording_files
 from makebreak.gap.data.robot import (
@@ -233,14 +234,21 @@ def run_inspect(
             names = ", ".join(file.name for file in here)
             notes.append(f"--robot FILE matches columns to joints; here are: {names}")
     robot = None if robot_path is None else read_robot(robot_path)
-    logs = []
+    read, refused = list[Log](), list[Inspected]()
     for path in paths:
         try:
-            logs.append(inspect_log(read_log(path, sidecar), robot))
+            read.append(read_log(path, sidecar))
         except ValueError as error:
             if len(paths) == 1:
                 raise
-            logs.append(Inspected(path, _kind(path), refused=str(error)))
+            refused.append(Inspected(path, _kind(path), refused=str(error)))
+    if robot is not None:
+        try:
+            read = gathered(read, robot)
+        except ValueError as error:
+            notes.append(str(error))
+    logs = [*(inspect_log(log, robot) for log in read), *refused]
+    logs.sort(key=lambda log: paths.index(log.path))
     found = Inspection(logs, robot, notes)
     if out is None:
         return found, []

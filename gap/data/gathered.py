@@ -1,0 +1,119 @@
+"""Logs that a command names: files of one log, such as a driver's states and another
+program's commands, are one recording."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from makebreak.gap.data.arrays import words_of
+from makebreak.gap.data.joined import joined
+from makebreak.gap.data.proposal import find_time, says_quantity
+from makebreak.gap.data.robot import Log, Robot, matches_of, read_log
+from makebreak.gap.data.table import stem_of
+
+_SHARE = 0.5  # Of the shorter one's time that two files of one log have in common.
+
+
+def read_logs(
+    paths: Sequence[Path], robot: Robot, sidecar: Path | None = None
+) -> list[Log]:
+    """The logs of these files; raises as read_log and gathered."""
+    return gathered([read_log(path, sidecar) for path in paths], robot)
+
+
+def gathered(logs: Sequence[Log], robot: Robot) -> list[Log]:
+    """Logs, with files of one log as one: those of a folder that have a common clock
+    and tell different things of the robot, as no column of one says what another one's
+    says already.
+
+    Raises: ValueError for a file without a position whose clock is that of no other.
+    """
+    whole: list[Log] = []
+    for log in sorted(logs, key=lambda log: -_positions(log, robot)):
+        fits = [k for k, one in enumerate(whole) if _tell_apart(one, log, robot)]
+        near = [k for k in fits if _common_share(whole[k], log) > _SHARE]
+        if near:
+            whole[near[0]] = _together(whole[near[0]], log)
+        elif fits and not _positions(log, robot):
+            first = whole[fits[0]]
+            raise ValueError(
+                f"recording {log.path} has no position of a joint and no clock in "
+                f"common with {first.path.name}: {_shown(log)} against {_shown(first)}"
+            )
+        else:
+            whole.append(log)
+    paths = [log.path for log in logs]
+    return sorted(whole, key=lambda log: paths.index(log.path))
+
+
+def _channels(log: Log, robot: Robot, prefix: str = "") -> list[str]:
+    table = replace(
+        log.table, columns={f"{prefix}{n}": y for n, y in log.table.columns.items()}
+    )
+    own = dict(log.own)
+    if prefix:
+        own["columns"] = {
+            f"{prefix}{n}": to for n, to in (own.get("columns") or {}).items()
+        }
+    matches = matches_of(replace(log, table=table, own=own), robot)
+    return [m.channel for m in matches if m.channel and "." in m.channel]
+
+
+def _prefix(log: Log) -> str:
+    """What a file's name says of its columns: `commands.csv` of q1, q2."""
+    words = [w for w in words_of(stem_of(log.path)) if says_quantity(w)]
+    return f"{'_'.join(words)}:" if words else ""
+
+
+def _positions(log: Log, robot: Robot) -> int:
+    return sum(c.endswith(".position") for c in _channels(log, robot, _prefix(log)))
+
+
+def _tell_apart(one: Log, other: Log, robot: Robot) -> bool:
+    """Whether two files of a folder say different things of the robot, and both any."""
+    if one.path.parent.resolve() != other.path.parent.resolve():
+        return False
+    a, b = (_channels(log, robot, _prefix(log)) for log in (one, other))
+    return bool(a) and bool(b) and not {*a} & {*b}
+
+
+def _span(log: Log) -> tuple[float, float]:
+    """First and last time [s]; NaN without a time."""
+    said = log.own.get("columns") or {}
+    of = {n: y for n, y in log.table.columns.items() if said.get(n) == "time"}
+    found = find_time(of or log.table.columns)
+    if found is None:
+        return np.nan, np.nan
+    time = found.scale * log.table.columns[found.column]
+    return float(np.nanmin(time)), float(np.nanmax(time))
+
+
+def _shown(log: Log) -> str:
+    return "{:.10g} to {:.10g} s".format(*_span(log))
+
+
+def _common_share(one: Log, other: Log) -> float:
+    (a, b), (c, d) = _span(one), _span(other)
+    return (min(b, d) - max(a, c)) / max(min(b - a, d - c), 1e-9)
+
+
+def _together(one: Log, other: Log) -> Log:
+    """A log with the columns of another file, which its sidecar joins to it."""
+    said = dict(one.own.get("columns") or {})
+    table = joined(one.path, one.table, [(other.path, other.table)], "time")
+    for name, to in (other.own.get("columns") or {}).items():
+        if to != "time":
+            key = f"{other.path.name}:{name}"
+            said[key if key in table.columns else name] = to
+    text = dict(one.text)
+    for name, cell in other.text.items():
+        text[name if name not in text else f"{other.path.name}:{name}"] = cell
+    more = one.own.get("join") or []
+    files = [more] if isinstance(more, str) else list(more)
+    own = {**one.own, "columns": said, "join": [*files, str(other.path.resolve())]}
+    says = f"{other.path.name} is joined to {one.path.name} by their times: one log"
+    notes = (*one.sidecar.notes, *other.sidecar.notes, says)
+    sidecar = replace(one.sidecar, sections=own, is_own=False, notes=notes)
+    return replace(one, table=table, text=text, own=own, sidecar=sidecar)
