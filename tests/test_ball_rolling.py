@@ -786,6 +786,7 @@ def short(tmp_path, seconds, *settings):
     return json.loads((out / "result.json").read_text())
 
 
+@pytest.mark.slow
 def test_a_ball_larger_than_modelled_is_felt_gently_and_its_gap_is_learned(tmp_path):
     """The first pushes: 98 N, where the height of a landing is taken for certain."""
     result = short(tmp_path, 6.0, "radius_error_m=-0.008")
@@ -805,6 +806,7 @@ def test_a_ball_smaller_than_modelled_is_found_and_only_with_adaptation(tmp_path
     assert frozen["time_to_first_contact_s"] is None
 
 
+@pytest.mark.slow
 def test_an_orange_is_found_and_rolled(tmp_path):
     """The fruits in short: not round, softer, and modelled 3 mm too large."""
     result = short(tmp_path, 8.0, "radius_error_m=0.003", "object=orange")

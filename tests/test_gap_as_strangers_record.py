@@ -65,6 +65,7 @@ def right(tmp_path_factory):
     return problem_of(folder, written(folder)[1])
 
 
+@pytest.mark.slow
 def test_a_block_on_feet_needs_no_stand_ins_and_one_on_its_face_does(right, tmp_path):
     assert lying_on_faces(right) == [] and point_on_face(right, []) == []
     world, scene = written(tmp_path)
@@ -111,6 +112,7 @@ def test_a_bias_of_a_force_sensor_is_seen_while_nothing_is_touched(right, tmp_pa
         problem.residual([Effect("sensor_bias", ["tip.x.position"], {"bias": 1.0})])
 
 
+@pytest.mark.slow
 def test_poses_that_come_late_are_put_where_they_belong(right, tmp_path):
     _, scene = written(tmp_path, late)
     recordings = read_recordings([tmp_path / "recording.csv"])

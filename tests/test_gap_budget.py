@@ -214,6 +214,7 @@ def test_signals_end_the_command_with_files(case, tmp_path, stage, number):
     assert "Ending with what is found so far" in err
 
 
+@pytest.mark.slow
 def test_an_older_complete_result_stays_beside_an_interrupted_one(case, tmp_path):
     words = [*case, "--out", "out"]
     assert command(words, tmp_path)[0] == 0

@@ -69,6 +69,7 @@ def rolled(folder: Path, tilt: float) -> Path:
     return write_ball_table(folder / "rolled.csv", rows)
 
 
+@pytest.mark.slow
 def test_a_table_tilted_by_a_hundredth_of_a_degree_shows_over_whole_episodes(tmp_path):
     tilt = np.deg2rad(0.01)
     scene, recording = ball_scene(tmp_path), rolled(tmp_path, tilt)

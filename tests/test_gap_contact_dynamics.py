@@ -394,6 +394,7 @@ def test_simulation_decides_between_what_equations_find_alike(
     assert asked == (["contact_friction"] if mass > 1.5 else [])
 
 
+@pytest.mark.slow
 def test_a_force_sensor_that_is_read_with_the_commands_sees_their_ripple(
     tmp_path, monkeypatch
 ):
@@ -445,6 +446,7 @@ def test_a_rail_s_friction_is_that_of_a_joint_that_moves(tmp_path, monkeypatch):
     assert abs(with_rest) < 0.004 and off(problem) > 0.005
 
 
+@pytest.mark.slow
 def test_a_robot_without_commands_is_led_as_it_was_measured(tmp_path, monkeypatch):
     """Its measured efforts, at 250 Hz, miss what an impact does between two rows: with
     them as the input the robot is soon elsewhere, and the object with it."""
@@ -670,6 +672,7 @@ def test_what_is_seen_in_two_blocks_is_fitted_and_held_out():
         assert len(set(train[model._block == block])) == 1
 
 
+@pytest.mark.slow
 def test_blocks_that_are_loud_by_what_was_learned_are_shared_out_again(
     tmp_path, monkeypatch
 ):
@@ -855,6 +858,7 @@ class Recorded:
         return []
 
 
+@pytest.mark.slow
 def test_what_a_planar_camera_says_of_the_height_is_not_compared(tmp_path):
     """Height and tilt that are the same number in all rows: windows judge the rest,
     which is at the noise with the true friction."""

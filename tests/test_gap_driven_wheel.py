@@ -219,6 +219,7 @@ def test_a_gain_is_as_well_as_the_masses_are_known(tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_two_frictions_for_which_a_gain_and_a_mass_could_stand_are_a_tie(tmp_path):
     """Of a slide whose effort alone is known: 0.45 for 0.25 on both plates, or a drive
     that gives 0.25/0.45 of its force and a sled that is as much lighter."""

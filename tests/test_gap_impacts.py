@@ -82,6 +82,7 @@ def test_impacts_are_told_by_windows_about_them(tmp_path):
     assert {"cart.rail.position", "cart.rail.velocity"} <= set(judged)
 
 
+@pytest.mark.slow
 def test_a_linear_damper_is_no_dissipation(tmp_path):
     """Walls that damp as most simulators' do, not as Hunt and Crossley say: no value of
     the dissipation explains them, a damper's does, and it is among what is tried."""
@@ -119,6 +120,7 @@ def test_a_linear_damper_is_no_dissipation(tmp_path):
     assert fitted.b[own.index(True)] == 0.0
 
 
+@pytest.mark.slow
 def test_shapes_that_are_not_alike_have_no_stiffness_to_be_unsure_of(
     tmp_path, monkeypatch
 ):
@@ -139,6 +141,7 @@ def test_shapes_that_are_not_alike_have_no_stiffness_to_be_unsure_of(
     assert not any(name.startswith("contact_") for name in problem.nuisances().names)
 
 
+@pytest.mark.slow
 def test_velocities_that_come_late_are_no_softer_wall(tmp_path):
     """0.1 ms, a twentieth of a row, take a stiff wall's stiffness along unless the
     velocities may be late."""
@@ -296,6 +299,7 @@ def test_from_files_to_what_is_missing(tmp_path, seed, hidden):
     assert result.verdict == ("gap_named" if hidden else "no_gap")
 
 
+@pytest.mark.slow
 def test_a_wall_that_stands_elsewhere_is_found_by_what_runs_against_it(tmp_path):
     scene_file, file, _ = ran(tmp_path, 3, 5.0)
     wall = tmp_path / "wall.sdf"

@@ -186,6 +186,7 @@ def test_a_box_that_is_tipped_stands_on_an_edge(tmp_path):
     assert np.median(count[tipped]) == 2
 
 
+@pytest.mark.slow
 def test_a_hole_is_left_and_met_as_it_is_felt(tmp_path):
     """All its walls are near all the time."""
     problem = problem_of(tmp_path, PressingProblem, "peg", 4, most=2)
@@ -200,6 +201,7 @@ def test_a_hole_is_left_and_met_as_it_is_felt(tmp_path):
     assert var.max() > 4.0 * np.median(var)
 
 
+@pytest.mark.slow
 def test_a_hole_that_stands_elsewhere_was_passed_through_the_walls_that_are_open(
     tmp_path,
 ):
@@ -229,6 +231,7 @@ def test_a_wall_stands_where_what_is_pushed_meets_it(tmp_path, seed, y):
     assert fit.score < 0.7 * start.score
 
 
+@pytest.mark.slow
 def test_a_body_that_stops_in_front_of_a_wall_touches_it_only_if_that_is_felt(
     tmp_path, monkeypatch
 ):
@@ -359,6 +362,7 @@ def found_in(folder, log="recording.csv"):
     return run_gap(folder / "scene.yaml", [folder / log])
 
 
+@pytest.mark.slow
 def test_one_quiet_joint_among_four_is_looked_into(tmp_path):
     """All joints together leave 1.1 times the noise, this one 1.7."""
     effects = foreign_logs.write("lift_first", "drag", 2, tmp_path)

@@ -109,6 +109,7 @@ def test_a_wall_where_the_scene_has_it_is_no_gap(tmp_path):
     assert (result.verdict, result.effects) == ("no_gap", [])
 
 
+@pytest.mark.slow
 def test_what_impacts_do_otherwise_is_said_and_what_lies_between_is_judged(tmp_path):
     """No law of the catalogue kicks a ball to the left and the next one to the right:
     nothing is named for it, and the sentence says where it is."""
@@ -130,6 +131,7 @@ def test_what_impacts_do_otherwise_is_said_and_what_lies_between_is_judged(tmp_p
     assert result.where
 
 
+@pytest.mark.slow
 def test_a_friction_of_which_the_scene_has_none_is_found(tmp_path):
     """Balls are set down with a speed and no spin: mu g slows each until it rolls, with
     5/7 of the speed. In a scene without friction it would go on as it was."""

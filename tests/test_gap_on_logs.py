@@ -94,6 +94,7 @@ def test_weights_of_two_links_add_up_and_those_of_one_do_not(tmp_path):
         assert np.abs(found - model.in_units(model.residual())).max() > 0.01
 
 
+@pytest.mark.slow
 def test_one_joint_among_quiet_ones_is_not_what_models_are_off_by(tmp_path):
     """Ripple is in no rich model: what is left of a joint must not become its noise."""
     recipe = Recipe("ripple", "scara", "multisine", "ripple")

@@ -220,6 +220,7 @@ def test_where_nothing_is_hidden_nothing_is_left_and_nothing_named(right):
     assert unjudged_channels(judged_channels(problem)) == ""
 
 
+@pytest.mark.slow
 def test_a_moment_is_what_the_force_has_where_shapes_touch(tmp_path):
     """A tool whose contact is 6 mm off has the same forces, and other moments."""
     scene = write_scene(tmp_path)
@@ -237,6 +238,7 @@ def test_bodies_that_stand_elsewhere_are_felt_there(displaced):
     assert off[WALL]["x"] == pytest.approx(0.025, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_places_that_were_felt_explain_recordings_that_nobody_looked_at(
     displaced, tmp_path
 ):
@@ -604,6 +606,7 @@ def test_faces_that_press_against_each_other_do_not_loosen_the_rows(
     assert problem.off == plain.off
 
 
+@pytest.mark.slow
 def test_where_only_efforts_were_measured_simulation_confirms_a_place(tmp_path):
     """A robot's states and efforts, without a command: windows take the efforts."""
     scene = write_scene(tmp_path)
@@ -640,6 +643,7 @@ def test_a_soft_contact_that_equations_take_for_a_place_is_told_by_simulation(tm
     assert stiffness == pytest.approx(2e4 / 0.99, rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_soft_contact_that_is_softer_is_no_face_that_stands_elsewhere(
     tmp_path, monkeypatch
 ):
@@ -810,6 +814,7 @@ def test_a_block_that_presses_went_through_no_face(block):
     assert problem.off == {}
 
 
+@pytest.mark.slow
 def test_a_tool_that_is_heavier_is_no_gain(tmp_path):
     """With no load among the candidates it came out as gains of all drives."""
     scene = write_scene(tmp_path)

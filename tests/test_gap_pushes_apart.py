@@ -147,6 +147,7 @@ def test_a_mean_in_which_a_normal_turns_is_left_out(turn, drops):
     assert PermittedContacts._turning(contacts).tolist() == [False]
 
 
+@pytest.mark.slow
 def test_a_long_recording_is_simulated_from_push_to_push(tmp_path, monkeypatch):
     """Pushed three times in nine seconds: windows begin before each of the pushes, with
     the tip away, and elsewhere; a short episode has two as before."""

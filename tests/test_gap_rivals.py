@@ -73,6 +73,7 @@ def test_a_gain_and_an_inertia_are_not_fitted_together(monkeypatch, other, known
     assert both is (found if known else None)
 
 
+@pytest.mark.slow
 def test_a_mass_and_a_friction_that_nearly_cancel_are_both_named(tmp_path):
     """A block that is lighter by a third on a table that is rougher by half: each alone
     changes little, and beside either alone a lower table is needed more."""

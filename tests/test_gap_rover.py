@@ -125,6 +125,7 @@ def rms(windows: PushWindows) -> float:
     return float(np.sqrt(np.mean(np.concatenate([e.ravel() for e in errors]) ** 2)))
 
 
+@pytest.mark.slow
 def test_wheels_touch_along_their_width(problem):
     lying, names = problem.lying(), problem.shapes.names
     assert {(names[k.body], names[k.ground]) for k in lying} == {

@@ -121,6 +121,7 @@ def test_bounces_at_a_cameras_rate_leave_no_more_than_noise(tmp_path):
     assert left(model) < 1.2
 
 
+@pytest.mark.slow
 def test_what_slows_a_ball_in_the_air_does_not_spoil_where_it_is_thought_to_start(
     tmp_path,
 ):

@@ -143,6 +143,7 @@ def test_a_stack_is_at_the_noise_with_its_own_friction(tmp_path):
     assert left[0] < 1.15 and left[1] > 2.0
 
 
+@pytest.mark.slow
 def test_the_friction_of_a_pair_is_that_of_the_one_on_top(tmp_path, monkeypatch):
     """Of the lower one it would change how that slides on the table, too."""
     monkeypatch.setattr(contact, "_patches", lambda *_: [])  # They take minutes.

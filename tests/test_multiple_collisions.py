@@ -91,6 +91,7 @@ def test_surfaces_frictions_and_estimates_vary_by_seed_within_their_bounds():
     )
 
 
+@pytest.mark.slow
 def test_a_known_height_narrows_both_regions_and_they_still_hold_the_surfaces():
     narrower = []
     for seed in range(100):

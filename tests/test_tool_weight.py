@@ -249,6 +249,7 @@ def test_a_sensor_whose_wrist_is_not_measured_cannot_be_turned(arm, tmp_path):
     assert check_tool_weight(arm, [replace(blind, wrenches={})]) == []
 
 
+@pytest.mark.slow
 def test_what_presses_half_of_the_time_is_weighed_while_it_does_not(tmp_path):
     """A gantry that presses its tool on a table and a wall, with 8 N, of a tool of
     20 N: the log says at once what is wrong, and what that line changes is right."""

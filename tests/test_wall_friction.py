@@ -250,6 +250,7 @@ def test_bad_settings_are_refused_by_name(change, says):
         make_wall_friction(replace(WallFrictionConfig(), **change))
 
 
+@pytest.mark.slow
 def test_a_fed_forward_prediction_takes_the_lag_off(trial):
     config, watched = trial
     before = tracking_error(watched, config)

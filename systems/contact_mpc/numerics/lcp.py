@@ -115,14 +115,15 @@ def solve_lcp_kernel(F, q):
     # there is a solution, and does not shrink with the 1e-12 if there is none.
     # Lemke's path may also end in a ray although there is a solution, where M is not
     # positive semi-definite, and rounding may break it where it nearly is not: hence
-    # the search. Where that finds nothing either, 1e-7 has to do.
+    # the search. Where that finds nothing either, a more regular F and 1e-7 have to do.
     if not best < 1e-9:
-        if _regular(M, b, 1e-12, 0, z) < 1e-9 or _search(M, b, z):
-            found = z
-        elif not best < 1e-7:
-            if not _regular(M, b, 1e-8, REBUILD, z) < 1e-7:
-                return lam, status
-            found = z
+        if not (
+            _regular(M, b, 1e-12, 0, z) < 1e-9
+            or _search(M, b, z)
+            or _regular(M, b, 1e-8, REBUILD, z) < 1e-7
+        ):
+            return lam, status
+        found = z
     for i in range(n):
         lam[i] = scale[i] * largest * found[i]
     return lam, SOLVED
