@@ -18,7 +18,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from makebreak.scripts.runner.outputs import STAGE
-from makebreak.scripts.runner.screenshot import screenshot
+from makebreak.scripts.runner.screenshot import moving_picture, screenshot
 from makebreak.scripts.runner.trials import makebreak_command
 from makebreak.systems.changing_contact.numerics.velocity_profile import (
     speed_transition,
@@ -30,14 +30,15 @@ DOCS, EXAMPLES = ROOT / "docs" / "pictures", ROOT / "examples"
 
 @dataclass(frozen=True)
 class Picture:
-    """The source of a picture: a page at a time of its own clock, a plot, or, with
-    live_sec, the Meshcat of a run that has simulated so many seconds."""
+    """The source of a picture: a page at a time of its own clock, a plot, an animation,
+    or, with live_sec, the Meshcat of a run that has simulated so many seconds."""
 
     command: str
     file: str = ""
     wait_ms: int = 15000
     size: tuple[int, int] = (1280, 800)
     live_sec: float = 0.0
+    moving_sec: float = 0.0  # Of an animation: how much of it is shown, moving.
     before: str = ""  # An example that makes the files of the command, in a folder.
 
 
@@ -47,7 +48,9 @@ def _figure(experiment: str, plot: str) -> Picture:
 
 _LOOP = "close-the-loop --seed 2"
 PICTURES = {
-    "ball_rolling.png": Picture("run ball_rolling --duration 24", "meshcat.html"),
+    "ball_rolling.webp": Picture(
+        "run ball_rolling --duration 24", "meshcat.html", moving_sec=18.0
+    ),
     "meshcat_live.png": Picture("run ball_rolling --seed 2", live_sec=14.0),
     "multiple_collisions.png": Picture("run multiple_collisions", "meshcat.html"),
     "push_object.png": Picture(
@@ -140,7 +143,9 @@ def make_pictures(names: list[str], out: Path, work: Path) -> None:
             made = folder / picture.file
             if not made.is_file():
                 raise RuntimeError(f"{command}: it made no {picture.file}")
-            if made.suffix == ".html":
+            if picture.moving_sec:
+                moving_picture(made, out / name, picture.moving_sec)
+            elif made.suffix == ".html":
                 screenshot(made, out / name, picture.size, picture.wait_ms)
             else:
                 shutil.copy(made, out / name)

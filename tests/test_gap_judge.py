@@ -104,3 +104,25 @@ def test_bad_input_is_one_line_and_status_2(case, words, says, monkeypatch, caps
     assert cli.main(["judge", *words]) == 2
     shown = capsys.readouterr().err
     assert says in shown and shown.count("\n") == 1, shown
+
+
+def test_columns_are_known_from_another_log_of_the_robot_or_as_they_are_told(
+    case, tmp_path, monkeypatch, capsys
+):
+    """Monday's sidecar is in the folder of the scene, as `gap` leaves it."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "monday").mkdir()
+    write_scene(case[0], tmp_path / "monday" / "scene.yaml")
+    text = case[2].read_text().replace("p.j1.position", "angle")
+    (tmp_path / "friday.csv").write_text(text)
+    columns = "columns: {angle: p.j1.position}\n"
+    words = ["judge", "monday/scene.yaml", "--on", "friday.csv", "--window", "0.5"]
+    assert cli.main(words) == 2
+    assert "angle" in capsys.readouterr().err
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "told.yaml").write_text(columns)
+    assert cli.main([*words, "--sidecar", "elsewhere/told.yaml"]) == 0
+    told = capsys.readouterr().out
+    (tmp_path / "monday" / "monday.yaml").write_text(columns)
+    assert cli.main(words) == 0
+    assert capsys.readouterr().out == told and "p.j1.position" in told

@@ -287,6 +287,7 @@ def make_parser(functions: Mapping[str, Callable]) -> argparse.ArgumentParser:
         "--on", nargs="+", required=True, metavar="RECORDING",
         help="recordings, that `gap` has not seen",
     )  # fmt: skip
+    p.add_argument("--sidecar", metavar="FILE", help=sidecar_help)
     p.add_argument(
         "--window", default="0.4", metavar="S",
         help="seconds that are predicted from each measured state (0.4)",

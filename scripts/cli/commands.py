@@ -240,7 +240,8 @@ def _judge(args) -> int:
 
     window = number(args.window, "--window", 0.0)
     scenes = [t if Path(t).is_file() else scene_file(t, "SCENE") for t in args.scenes]
-    show(judge_scenes(scenes, [Path(text) for text in args.on], window))
+    given = Path(args.sidecar) if args.sidecar else None
+    show(judge_scenes(scenes, [Path(text) for text in args.on], window, given))
     return 0
 
 

@@ -131,7 +131,9 @@ def run_and_report(
             )
             print_files(out.keep(), sys.stderr)
         else:
-            sidecars, notes = known_sidecars(scene_path, recording_paths, out, sidecar)
+            sidecars, notes = known_sidecars(
+                scene_path, recording_paths, out.file, sidecar
+            )
         if export:  # Raises before anything is computed.
             exported(read_scene(scene_path), export)
         from makebreak.gap.workflow import run_gap  # Here, as it takes long to import.
@@ -201,13 +203,16 @@ def sidecar_near(scene_path: Path, recording: Path) -> Path | None:
 
 
 def known_sidecars(
-    scene_path: Path, recording_paths: Sequence[Path], out: OutputFolder, given
+    scene_path: Path,
+    recording_paths: Sequence[Path],
+    file: Callable[[str], Path],
+    given,
 ) -> tuple[dict[Path, Path], list[str]]:
     """{recording: sidecar} for recordings without a sidecar of their own: one of this
     name in the scene's folder, where a proposal is written; else that of another log
     of the robot, which is written for this one. And what is to be said of it.
 
-    Args: given: in place of any other.
+    Args: file: the path for a new file of this name; given: in place of any other.
     """
     from makebreak.gap.data.robot import read_log
 
@@ -226,7 +231,7 @@ def known_sidecars(
         own = read_log(path, given, folders).sidecar
         notes += own.notes
         if own.sections:
-            found[path] = out.file(sidecar_of(path).name)
+            found[path] = file(sidecar_of(path).name)
             found[path].write_text(yaml.safe_dump(dict(own.sections), sort_keys=False))
     return found, notes
 

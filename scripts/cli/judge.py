@@ -7,28 +7,32 @@ one that `makebreak gap` wrote, and recordings that were not given to `makebreak
 
 from collections.abc import Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from makebreak.gap.data.reading import read_recordings
-from makebreak.gap.data.sidecar import has_sidecar
 from makebreak.gap.simulation.judge import judge
 from makebreak.models.scene import read_scene
-from makebreak.scripts.cli.gap_command import sidecar_near
+from makebreak.scripts.cli.gap_command import known_sidecars
 from makebreak.scripts.runner.table import Table
 
 
 def judge_scenes(
-    scenes: Sequence[str], recordings: Sequence[Path], window_sec: float
+    scenes: Sequence[str],
+    recordings: Sequence[Path],
+    window_sec: float,
+    sidecar: Path | None = None,
 ) -> Table:
     """A row for each channel, a column for each scene. A recording without a sidecar of
-    its own is read as the one beside the first scene says, as by `makebreak gap`.
+    its own is read as by `makebreak gap` with the first scene.
 
+    Args: sidecar: of all recordings, in place of their own.
     Raises: ValueError for scenes and recordings that cannot be used.
     """
-    found = {
-        p: sidecar_near(Path(scenes[0]), p) for p in recordings if not has_sidecar(p)
-    }
-    sidecars = {p: near for p, near in found.items() if near is not None}
-    tables = read_recordings(recordings, sidecars=sidecars)
+    with TemporaryDirectory() as folder:
+        sidecars, _ = known_sidecars(
+            Path(scenes[0]), recordings, Path(folder).joinpath, sidecar
+        )
+        tables = read_recordings(recordings, sidecars=sidecars)
     judged = [judge(read_scene(path), tables, window_sec) for path in scenes]
     first = judged[0]
     rows: list[tuple] = []
