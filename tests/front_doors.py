@@ -17,6 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import MultibodyForces
 from scipy.io import savemat
 from scipy.spatial.transform import Rotation
@@ -52,8 +54,16 @@ ROBOTS = {
     "wrist6": [("revolute", "0 0 1", 6.2), ("revolute", "0 1 0", 2.1),
                ("revolute", "0 1 0", 3.9), ("revolute", "1 0 0", 6.2),
                ("revolute", "0 1 0", 3.1), ("revolute", "1 0 0", 6.2)],
+    "gripper": [("revolute", "0 0 1", 2.9), ("revolute", "0 1 0", 2.4),
+                ("revolute", "0 1 0", 2.6), ("prismatic", "1 0 0", 0.8),
+                ("prismatic", "-1 0 0", 0.8)],
+    "hexapod": [("revolute", "0 0 1", 2.2), ("revolute", "0 1 0", 2.4),
+                ("revolute", "0 1 0", 2.7)],
 }  # fmt: skip
-PARENTS = {"hand": {3: "base"}}  # Where a link does not hang from the one before.
+# Where a link does not hang from the one before.
+PARENTS = {"hand": {3: "base"}, "gripper": {5: "l3"}}
+LATER = ("gripper", "scara", "wrist6", "hexapod")  # Robots of the latest kinds.
+TILT = Rotation.from_euler("xyz", [35.0, -25.0, 20.0], degrees=True)
 
 
 def urdf(name: str, rng) -> str:
@@ -82,6 +92,7 @@ class Log:
     limits: list[float]
     slides: list[bool]
     weight: np.ndarray
+    tilted: np.ndarray  # Its weight on a base that is turned by TILT.
     rng: np.random.Generator
     write: Callable[[Path, dict], Path] | None = None
 
@@ -104,13 +115,16 @@ def exact(name: str, folder: Path, rng) -> tuple[Path, Log]:
             a[:, i] -= s * w * w * np.sin(w * t + phase)
     plant, tau = robot.plant, np.zeros_like(q)
     context, forces = plant.CreateDefaultContext(), MultibodyForces(plant)
-    weight = np.zeros_like(q)
+    weight, tilted = np.zeros_like(q), np.zeros_like(q)
+    turned = _load_tilted(path, robot)
     for k in range(len(t)):
         plant.SetPositions(context, q[k])
         plant.SetVelocities(context, v[k])
         plant.CalcForceElementsContribution(context, forces)
         tau[k] = plant.CalcInverseDynamics(context, a[k], forces)
         weight[k] = -plant.CalcGravityGeneralizedForces(context)
+        turned[0].SetPositions(turned[1], q[k])
+        tilted[k] = -turned[0].CalcGravityGeneralizedForces(turned[1])
     if rng.random() < 0.5:
         i = int(rng.integers(n))
         tau[:, i] += 0.15 * np.std(tau[:, i]) * np.sign(v[:, i])
@@ -123,7 +137,18 @@ def exact(name: str, folder: Path, rng) -> tuple[Path, Log]:
             short = what.split("_")[0]
             columns[f"joint{i + 1}_{short}"] = y[:, i] + rng.normal(0.0, noise, len(t))
     limits = [j.upper for j in robot.joints]
-    return path, Log(t, columns, truth, n, limits, slides, weight, rng)
+    return path, Log(t, columns, truth, n, limits, slides, weight, tilted, rng)
+
+
+def _load_tilted(path: Path, robot):
+    """The robot under gravity as its base feels it where it is turned by TILT."""
+    plant = MultibodyPlant(0.0)
+    Parser(plant).AddModels(str(path))
+    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName(robot.bases[0]))
+    down = TILT.inv().apply([0.0, 0.0, -9.81])
+    plant.mutable_gravity_field().set_gravity_vector(down)
+    plant.Finalize()
+    return plant, plant.CreateDefaultContext()
 
 
 def names(log: Log, what: str) -> list[str]:
@@ -247,7 +272,9 @@ def currents(log: Log):
 
 
 def turns(log: Log):
-    i = next(k for k in range(log.joints) if not log.slides[k])
+    i = next((k for k in range(log.joints) if not log.slides[k]), None)
+    if i is None:
+        return ("",)
     name = f"joint{i + 1}_position"
     q = log.columns[name]
     q = q + (np.pi - np.quantile(q, 0.8))
@@ -497,6 +524,7 @@ def hung(log: Log):
 
 def lost_rows(log: Log):
     kept = np.flatnonzero(log.rng.random(len(log.time)) > 0.15)
+    kept[0] = 0
     return kept, log.time
 
 
@@ -592,6 +620,245 @@ def empty_velocity(log: Log):
 
 def noise(log, of):
     return 0.1 * np.std(of["effort"]) * log.rng.normal(size=len(log.time))
+
+
+# ----- A third time: further wrong things, for robots of LATER.
+
+
+def tilted_base(log: Log):
+    """A base that stands tilted, its quaternion as an array with w first."""
+    n = len(log.time)
+    off = Rotation.from_rotvec(log.rng.normal(0.0, 1e-3, (n, 3)))
+    turned = (TILT * off).as_quat(scalar_first=True)
+    log.columns |= {f"base_orientation[{k}]": turned[:, k] for k in range(4)}
+    for k in range(log.joints):
+        more = log.tilted[:, k] - log.weight[:, k]
+        log.truth[f"arm.joint{k + 1}.effort_measured"] += more
+        log.columns[f"joint{k + 1}_effort"] += more
+    return ("at the pose that the log has",)
+
+
+def two_robots(log: Log):
+    """The columns of another arm of this kind, which moved otherwise, come after."""
+    later = {f"right/{name}": np.roll(y, 377) for name, y in log.columns.items()}
+    log.columns = {f"left/{name}": y for name, y in log.columns.items()} | later
+    return ("is another column", "right/")
+
+
+def all_in_another_order(log: Log):
+    """As a simulator that sorts its joints gives arrays without names."""
+    order = log.rng.permutation(log.joints)
+    if (order == np.arange(log.joints)).all():
+        order = np.roll(order, 1)
+    own = {}
+    for what in ("position", "velocity", "effort"):
+        mine = names(log, what)
+        own |= {f"{what}[{i}]": log.columns[mine[k]] for i, k in enumerate(order)}
+    log.columns = own
+    return ("order", "swapped", "one off")
+
+
+def backward_differences(log: Log):
+    step = log.time[1] - log.time[0]
+    for i, name in enumerate(names(log, "velocity")):
+        q = log.truth[f"arm.joint{i + 1}.position"]
+        log.columns[name] = np.diff(q, prepend=q[0]) / step
+    log.truth = {k: y for k, y in log.truth.items() if "velocity" not in k}
+    return ("backward difference",)
+
+
+def quarter_turn(log: Log):
+    """Another zero of one joint that carries weight."""
+    load = np.std(log.weight, axis=0) * ~np.array(log.slides)
+    i = int(np.argmax(load))
+    log.columns[f"joint{i + 1}_position"] += 0.5 * np.pi
+    if load[i] == 0.0:  # Nothing shows it.
+        log.truth.pop(f"arm.joint{i + 1}.position")
+    return ("-90 deg",) if load[i] > 0.0 else ("",)
+
+
+def one_in_degrees(log: Log):
+    if all(log.slides):
+        return ("",)
+    i = max(k for k in range(log.joints) if not log.slides[k])
+    name = f"joint{i + 1}_position"
+    log.columns[name] = np.rad2deg(log.columns[name])
+    return ("deg",)
+
+
+def ticks(log: Log):
+    """Of an encoder with 4096 in a turn, whose middle is 2048."""
+    for i, name in enumerate(names(log, "position")):
+        if not log.slides[i]:
+            turns = log.columns[name] / (2.0 * np.pi)
+            log.columns[name] = np.rint(2048.0 + 4096.0 * turns)
+    return ("steps of",) if not all(log.slides) else ("",)
+
+
+def as_text(edit, *words):
+    """The csv's lines, edited."""
+
+    def wrong(log: Log):
+        def write(folder: Path, columns: dict) -> Path:
+            path = csv_of(folder / "log.csv", columns)
+            path.write_bytes(edit(path.read_text()).encode())
+            return path
+
+        log.columns = {"time": log.time} | log.columns
+        log.write = write
+        return words
+
+    return wrong
+
+
+def nan_at_start(log: Log):
+    """The first readings are not there yet, of all but the time."""
+    for name in log.columns:
+        log.columns[name][:60] = np.nan
+    log.columns = {"time": log.time} | log.columns
+    log.truth = {}
+
+    def write(folder: Path, columns: dict) -> Path:
+        return csv_of(folder / "log.csv", columns)
+
+    log.write = write
+    return ("",)
+
+
+def commands_in_degrees(log: Log):
+    """Goals in degrees beside positions in rad, and nothing else."""
+    own = {}
+    for i in range(log.joints):
+        q = log.columns[f"joint{i + 1}_position"]
+        at = f"arm.joint{i + 1}"
+        goal = np.interp(log.time + 0.04, log.time, log.truth[f"{at}.position"])
+        log.truth[f"{at}.position_command"] = goal
+        own |= {
+            f"joint{i + 1}_position": q,
+            f"joint{i + 1}_goal": goal if log.slides[i] else np.rad2deg(goal),
+        }
+    log.columns = own
+    log.truth = {k: y for k, y in log.truth.items() if "position" in k}
+    return ("deg",) if not all(log.slides) else ("",)
+
+
+def zeros_before_power(log: Log):
+    for y in log.columns.values():
+        y[:200] = 0.0
+    log.truth = {"after": np.array([2.0]), **log.truth}
+    return ("stand still", "power", "zero")
+
+
+def block_twice(log: Log):
+    """A part of the file was written a second time, at its end."""
+    k = np.append(np.arange(len(log.time)), np.arange(300, 500))
+    log.columns = {"time": log.time[k]} | {n: y[k] for n, y in log.columns.items()}
+    log.truth = {}
+    return ("once more", "step back", "starts again")
+
+
+def zero_to_two_pi(log: Log):
+    for i, name in enumerate(names(log, "position")):
+        if not log.slides[i]:
+            log.columns[name] = np.mod(log.columns[name], 2.0 * np.pi)
+    return ("turn",)
+
+
+def two_part_stamps(log: Log):
+    at = 1_764_280_000.25 + log.time
+    sec = np.floor(at)
+    nsec = np.rint(1e9 * (log.time + 0.25 - np.floor(log.time + 0.25)))
+    stamps = {"header.stamp.sec": sec, "header.stamp.nanosec": nsec}
+    log.columns = stamps | log.columns
+    log.write = lambda folder, columns: csv_of(folder / "log.csv", columns)
+    return ("nanosec",)
+
+
+def mm_and_degrees(log: Log):
+    for i in range(log.joints):
+        factor = 1e3 if log.slides[i] else 180.0 / np.pi
+        for what in ("position", "velocity"):
+            log.columns[f"joint{i + 1}_{what}"] *= factor
+    return ("deg", "mm")
+
+
+def date_with_comma(log: Log):
+    """As Python's logging writes it, in a file of semicolons."""
+    start = np.datetime64("2026-11-27T22:00:00", "ms")
+    stamps = start + np.rint(1e3 * log.time).astype("timedelta64[ms]")
+    text = [str(s).replace("T", " ").replace(".", ",") for s in stamps]
+
+    def write(folder: Path, columns: dict) -> Path:
+        rows = [";".join([s, *(f"{x:.9g}" for x in row)])
+                for s, row in zip(text, zip(*columns.values(), strict=True),
+                                  strict=True)]  # fmt: skip
+        path = folder / "log.csv"
+        path.write_text("\n".join([";".join(["asctime", *columns]), *rows]) + "\n")
+        return path
+
+    log.write = write
+    return ("",)
+
+
+def header_again(text: str) -> str:
+    """The logger was started a second time with the same file."""
+    head, *rows = text.splitlines()
+    return "\n".join([head, *rows[:700], head, *rows[700:]]) + "\n"
+
+
+def one_velocity_sign(log: Log):
+    name = names(log, "velocity")[-1]
+    log.columns[name] = -log.columns[name]
+    return ("other sign",)
+
+
+def rows_of_their_own(log: Log):
+    """Topics written as they come: each row has one topic's numbers."""
+    n = len(log.time)
+    for name, y in log.columns.items():
+        k = ("position", "velocity", "effort").index(name.split("_")[1])
+        y[np.arange(n) % 3 != k] = np.nan
+    log.columns = {"time": log.time} | log.columns
+    log.truth = {}
+    return ("",)
+
+
+def with_status(log: Log):
+    """Text and flags beside the numbers."""
+    n = len(log.time)
+
+    def write(folder: Path, columns: dict) -> Path:
+        head = [*columns, "state", "enabled", "fault"]
+        rows = [
+            ",".join(
+                [
+                    *(f"{x:.12g}" for x in row),
+                    "RUN" if k < n // 2 else "HOLD",
+                    "TRUE",
+                    "None",
+                ]
+            )
+            for k, row in enumerate(zip(*columns.values(), strict=True))
+        ]
+        path = folder / "log.csv"
+        path.write_text("\n".join([",".join(head), *rows]) + "\n")
+        return path  # fmt: skip
+
+    log.columns = {"time": log.time} | log.columns
+    log.write = write
+    return ("",)
+
+
+def tabs_and_commas(text: str) -> str:
+    return text.replace(",", "\t").replace(".", ",")
+
+
+def bad_cells(text: str) -> str:
+    """As a C++ program for Windows prints what is no number."""
+    head, *rows = text.splitlines()
+    for k in range(5, len(rows), 45):
+        rows[k] = ",".join([*rows[k].split(",")[:-1], "-nan(ind)"])
+    return "\n".join([head, *rows]) + "\n"
 
 
 KINDS = {
@@ -700,8 +967,38 @@ KINDS = {
     "a name that comes twice": twice_named,
     "positions in hundredths of a degree": hundredths,
     "efforts swapped and of other sign": swapped_and_sign,
+    # A third time.
+    "a tilted base": tilted_base,
+    "two robots in one log": two_robots,
+    "all columns in another order": all_in_another_order,
+    "velocities as backward differences": backward_differences,
+    "one position off by 90 degrees": quarter_turn,
+    "one joint in degrees": one_in_degrees,
+    "steps of encoders from 2048": ticks,
+    "a header behind a hash": as_text(lambda text: f"# {text}", ""),
+    "tabs and decimal commas": as_text(tabs_and_commas, ""),
+    "trailing commas": as_text(lambda text: text.replace("\n", ",\n"), ""),
+    "a byte order mark and CRLF": as_text(
+        lambda text: "\ufeff" + text.replace("\n", "\r\n"), ""
+    ),
+    "nothing at the start": nan_at_start,
+    "commands in degrees": commands_in_degrees,
+    "zeros before power": zeros_before_power,
+    "a block of rows twice": block_twice,
+    "positions from 0 to 2 pi": zero_to_two_pi,
+    "stamps in two parts": two_part_stamps,
+    "velocities in turns": rates(1.0 / (2.0 * np.pi), "rev", "turn"),
+    "mm and degrees": mm_and_degrees,
+    "dates with a comma": date_with_comma,
+    "the last row cut": as_text(lambda text: text[:-40], "cut", "last row"),
+    "the header again": as_text(header_again, "header"),
+    "cells of nan(ind)": as_text(bad_cells, ""),
+    "time in days": stamps(lambda log: 46_000.25 + log.time / 86_400.0, "time"),
+    "one velocity of other sign": one_velocity_sign,
+    "topics on rows of their own": rows_of_their_own,
+    "a status beside": with_status,
 }  # fmt: skip
-UNSEEN = list(KINDS)[list(KINDS).index("names of a controller") :]
+UNSEEN = list(KINDS)[list(KINDS).index("a tilted base") :]
 
 
 @dataclass(frozen=True)
@@ -744,6 +1041,8 @@ def seen(robot_path: Path, log_path: Path, log: Log) -> Seen:
     (recording,) = recordings
     errors = [f for f in findings if f.severity == "error"]
     right = not errors
+    after = float(log.truth.pop("after", [-np.inf])[0])
+    shift = log.time[-1] - recording.time[-1] if after > 0.0 else 0.0
     for name, true in log.truth.items():
         if name == "turns":
             q = recording[f"arm.joint{true[0] + 1}.position"]
@@ -754,9 +1053,11 @@ def seen(robot_path: Path, log_path: Path, log: Log) -> Seen:
             continue
         mine = recording[name]
         if len(mine) != len(true):  # Rows were left out.
-            true = np.interp(recording.time, log.time, true)
+            true = np.interp(recording.time + shift, log.time, true)
         # A factor's digits are those that the data tell; friction is what it is.
         scale = np.std(true) or 1.0
+        kept = (recording.time + shift > after) & np.isfinite(mine)
+        true, mine = true[kept[: len(true)]], mine[kept]
         turn = 0.0
         if name.endswith(".position"):
             turn = np.round(np.median(true - mine) / (2 * np.pi)) * 2 * np.pi
@@ -794,7 +1095,8 @@ def main() -> None:
     good, n = [0, 0], 0
     for k in range(args.count):
         kind = kinds[k % len(kinds)]
-        robot = list(ROBOTS)[int(rng.integers(len(ROBOTS)))]
+        robots = LATER if args.unseen else list(ROBOTS)
+        robot = robots[int(rng.integers(len(robots)))]
         seed = int(rng.integers(1 << 30))
         with tempfile.TemporaryDirectory() as folder:
             try:

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from makebreak.gap.data.bags import motor_ranges
-from makebreak.gap.data.proposal import JointName, propose
+from makebreak.gap.data.match import JointName
+from makebreak.gap.data.proposal import propose
 from makebreak.gap.data.reading import read_recording
 from makebreak.gap.data.table import read_table
 

@@ -83,7 +83,7 @@ def test_degrees_for_radians_are_said_first_and_the_run_goes_on(
     result = json.loads((tmp_path / "out/result.json").read_text())
     assert result["effects"] == [] and result["verdict"] != "gap_named"
     checks = result["checks"]
-    assert [c["channel"] for c in checks if c["kind"] == "units"] == [V]
+    assert [c["channel"] for c in checks if c["kind"] == "units"] == [Q]
     page = (tmp_path / "out/report.html").read_text()
     first = page[page.index('<section class="first">') : page.index("</section>")]
     assert "position is in degrees" in first

@@ -9,7 +9,8 @@ from gap_benchmark.cases import cases, make
 from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.gap.data.findings import NO_COLUMN
-from makebreak.gap.data.proposal import JointName, of_one_drive, propose
+from makebreak.gap.data.match import JointName
+from makebreak.gap.data.proposal import of_one_drive, propose
 from makebreak.gap.data.reading import read_recording
 from makebreak.gap.data.robot import propose_scene, read_log, read_robot
 from makebreak.gap.data.servo_gains import ServoGains, _fitted, _fitted_at

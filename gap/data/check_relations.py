@@ -1,5 +1,7 @@
 """How channels of a recording relate to each other where they measure one motion."""
 
+from collections.abc import Collection
+
 import numpy as np
 
 from makebreak.gap.data.findings import (
@@ -11,6 +13,7 @@ from makebreak.gap.data.findings import (
 )
 from makebreak.gap.data.recording import Recording, unit_of
 from makebreak.gap.data.table import TWIST
+from makebreak.gap.data.units import unit_of_rate
 from makebreak.gap.numerics.signal_relation import (
     Relation,
     angular_velocity,
@@ -18,23 +21,17 @@ from makebreak.gap.numerics.signal_relation import (
 )
 from makebreak.systems.numerics.filters import filtered
 
-# Ratios of velocity to differentiated position that a wrong unit explains.
-_RATIOS = (
-    (np.pi / 180.0, "the position is in degrees, or the velocity in rad/s beside it"),
-    (180.0 / np.pi, "the velocity is in degrees per second"),
-    (1e-3, "the position is in mm"),
-    (1e3, "the velocity is in mm/s, or the time in milliseconds"),
-    (2.0 * np.pi / 60.0, "the position is in other units than the velocity"),
-    (60.0 / (2.0 * np.pi), "the velocity is in revolutions per minute"),
-)
 
-
-def check_relations(recording: Recording) -> list[Finding]:
+def check_relations(recording: Recording, told: Collection[str]) -> list[Finding]:
     """Velocity against position, measured against commanded effort: scale, bias, lag,
-    and a lag that grows, which is a clock that runs fast or slow."""
+    and a lag that grows, which is a clock that runs fast or slow.
+
+    Args: told: channels that are in other units than they should.
+    """
     found: list[Finding] = []
     for at in recording.places(("velocity",)):
-        if f"{at}.position" in recording:
+        pair = {f"{at}.position", f"{at}.velocity"}
+        if f"{at}.position" in recording and not pair & {*told}:
             relation = _related(recording, f"{at}.velocity", f"{at}.position", 1)
             found += _velocity_findings(recording, f"{at}.velocity", relation)
     for at in recording.places(TWIST):
@@ -64,11 +61,14 @@ def _velocity_findings(
     def add(kind: str, size: float, unit: str, severity: str, says: str) -> None:
         found.append(Finding(kind, recording.name, name, size, unit, severity, says))
 
-    for ratio, why in _RATIOS:
-        if abs(abs(r.scale) / ratio - 1.0) < 0.03:
-            says = f"{name} is {r.scale:.4g} times the derivative of position: {why}."
-            add("units", r.scale, "1", "error", says)
-            return found
+    wrong = unit_of_rate(1.0 / r.scale, prismatic=unit == "m/s")
+    if wrong is not None and wrong.factor != 1.0:
+        says = (
+            f"{name} is {r.scale:.4g} times the derivative of position, as if in "
+            f"{wrong.name}."
+        )
+        add("units", r.scale, "1", "error", says)
+        return found
     if r.scale < 0.0:
         says = f"{name} has the opposite sign of the derivative of position."
         add("sign", r.scale, "1", "error", says)

@@ -13,8 +13,10 @@ from makebreak.gap.data.check_relations import check_relations
 from makebreak.gap.data.clock import clock_period
 from makebreak.gap.data.filters import EXAMPLES
 from makebreak.gap.data.findings import Finding, JointFacts, SceneFacts, longest_sec
+from makebreak.gap.data.match import JointName, Match
 from makebreak.gap.data.recording import Channel, Recording, unit_of
 from makebreak.gap.data.table import COMMANDS
+from makebreak.gap.data.units import in_units, said_of_units
 from makebreak.systems.numerics.filters import mean_delay
 
 
@@ -31,8 +33,9 @@ def check_recordings(
         found += _notes(recording)
         found += check_filters(recording)
         found += check_clock(recording)
-        found += check_units(recording, facts)
-        found += check_relations(recording)
+        units = check_units(recording, facts)
+        found += units
+        found += check_relations(recording, {f.channel for f in units})
         found += check_values(recording, facts)
         found += check_commands(recording, facts)
         found += check_gravity(recording, facts)
@@ -150,44 +153,31 @@ def check_filters(recording: Recording) -> list[Finding]:
 
 
 def check_units(recording: Recording, facts: SceneFacts) -> list[Finding]:
-    """Degrees for radians, millimetres for metres, milliseconds for seconds."""
-    found = []
-
-    def suspect(channel: str, size: float, unit: str, says: str) -> None:
-        found.append(
-            Finding("units", recording.name, channel, size, unit, "error", says)
+    """Of joints what in_units finds; millimetres for metres of bodies."""
+    columns = {"time": recording.time}
+    columns |= {c.name: c.values for c in recording.channels.values()}
+    joints = []
+    for at in recording.places(("position",)):
+        own = facts.joints.get(at, JointFacts())
+        joints.append(JointName(at, own.prismatic, own.lower, own.upper))
+    matches = in_units(columns, joints, {name: Match(name, name) for name in columns})
+    found = [
+        Finding(
+            kind, recording.name, channel, size, "", "error",
+            f"{says} Its scale in the sidecar is {size:.6g}.",
         )
-
+        for kind, channel, size, says in said_of_units(matches.values())
+    ]  # fmt: skip
     for channel in recording.channels.values():
-        y = channel.values[~np.isnan(channel.values)]
-        if not y.size:
-            continue
-        most = float(np.abs(y).max())
-        joint = facts.joints.get(channel.at)
-        if channel.quantity in ("position", "position_command") and joint is not None:
-            limit = max(abs(joint.lower), abs(joint.upper))
-            unit, factor = ("mm", 1e-3) if joint.prismatic else ("deg", np.pi / 180.0)
-            # Only what the other unit would put right.
-            if (
-                np.isfinite(limit)
-                and most > 3.0 * limit
-                and factor * most < 1.2 * limit
-            ):
-                suspect(
-                    channel.name,
-                    most,
-                    unit,
-                    f"{channel.name} reaches {most:.4g}, the joint's limit is "
-                    f"{limit:.4g} {unit_of('position', joint.prismatic)}: it looks as "
-                    f"if it were in {unit}.",
+        y = np.abs(channel.values[~np.isnan(channel.values)])
+        if channel.quantity in "xyz" and y.size and float(np.median(y)) > 50.0:
+            size = float(np.median(y))
+            says = f"{channel.name} is {size:.4g} m in the median: it looks as if it "
+            says += "were in mm."
+            found.append(
+                Finding(
+                    "units", recording.name, channel.name, size, "mm", "error", says
                 )
-        if channel.quantity in "xyz" and float(np.median(np.abs(y))) > 50.0:
-            suspect(
-                channel.name,
-                most,
-                "mm",
-                f"{channel.name} is {np.median(np.abs(y)):.4g} m in the median: it "
-                "looks as if it were in mm.",
             )
     return found
 

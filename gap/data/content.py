@@ -14,20 +14,17 @@ that drives nothing (no joint fits, or nothing is in it).
 """
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
+from itertools import combinations, permutations
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 from scipy.optimize import linear_sum_assignment
 
 from makebreak.gap.data.findings import Finding
-from makebreak.gap.data.proposal import (
-    AS_SAID,
-    BY_DERIVATIVE,
-    CURRENT,
-    JointName,
-    Match,
-)
+from makebreak.gap.data.match import AS_SAID, JointName, Match
+from makebreak.gap.data.proposal import CURRENT
 from makebreak.gap.data.recording import Recording
 from makebreak.gap.data.servo_gains import (
     ServoLog,
@@ -54,6 +51,8 @@ GAINS = (0.45, 1.6)
 # Shares of an effort that is the weight's, to tell by; of the weight that one without
 # it may still have.
 WEIGHS, LEFT_OUT = 0.1, 0.2
+FEW, MOST_ORDERED = 100, 6  # Instants, joints, that all orders are tried of.
+ROOM = 0.1  # Of a joint's range, beyond it.
 NO_WEIGHT = 0.02  # Of what an effort without weight leaves at most.
 # Of one joint alone, what it carries may make its effort so many times larger; what
 # holds it up, smaller.
@@ -67,12 +66,6 @@ _UNITS = (
     (9.80665, "as if in kgf m"), (0.112985, "as if in lbf in"),
     (1.355818, "as if in lbf ft"),
 )  # fmt: skip
-
-
-# [rad] Degrees, tenths to thousandths of them, mrad, steps of encoders.
-_ANGLES = (*(np.pi / 180.0 * 10.0**-k for k in range(4)), 1e-3,
-           *(TURN / 2.0**bits for bits in range(9, 25)))  # fmt: skip
-_TIMES = (*(10.0**k for k in range(-6, 7)), 60.0, 3600.0)
 
 
 @dataclass(frozen=True)
@@ -180,35 +173,66 @@ class Contents:
         self._rows = self._rows[: np.searchsorted(t, t[0] + MOST_SEC)]
         self._time = time[self._rows]
         self._all_time = time
-        self.moved(range(len(joints)), q)
-
-    def at_times(self, matches: Sequence[Match]) -> "Contents":
-        """The same with another unit of time."""
-        return Contents(self._plant, self.joints, self._columns, matches)
-
-    def moved(self, order: Sequence[int], q: np.ndarray | None = None) -> None:
-        """With the positions (n, n_q), or those of before in another order."""
-        if q is not None:
-            self._q = q[self._rows]
-        averaged = averaged_motion(
-            ServoLog(self._time, self._q[:, list(order)], self._q)
-        ) if len(self._time) > 20 else None  # fmt: skip
+        q = q[self._rows]
+        averaged = averaged_motion(ServoLog(self._time, q, q)) if len(q) > 20 else None
         if averaged is None:
             raise TooShort("too short to tell what columns are by what is in them")
         self._even, _, _, self._kernels, states = averaged
         self._some = slice(None, None, max(len(states[0]) // MOST_SAMPLES, 1))
-        self.q, self.v, self.vd = (x[self._some] for x in states)
-        self.needed = needed_efforts(self._plant, self.q, self.v, self.vd)
-        context = self._plant.CreateDefaultContext()
-        self.weight = np.empty_like(self.needed)
-        for k, q in enumerate(self.q):
-            self._plant.SetPositions(context, q)
-            self.weight[k] = -self._plant.CalcGravityGeneralizedForces(context)
+        self._motion = [x[self._some].copy() for x in states]
+        self.take(*self._motion)
+
+    def take(self, q: np.ndarray, v: np.ndarray, vd: np.ndarray) -> None:
+        """(m, n_q) as the joints' positions, velocities and accelerations."""
+        self.q, self.v, self.vd = q, v, vd
+        self.needed = needed_efforts(self._plant, q, v, vd)
+        self._weight: np.ndarray | None = None
+
+    @property
+    def weight(self) -> np.ndarray:
+        """(m, n_q) what gravity needs of the joints."""
+        if self._weight is None:
+            context = self._plant.CreateDefaultContext()
+            self._weight = np.empty_like(self.needed)
+            for k, q in enumerate(self.q):
+                self._plant.SetPositions(context, q)
+                tau = self._plant.CalcGravityGeneralizedForces(context)
+                self._weight[k] = -tau
+        return self._weight
+
+    def moved(self, order: Sequence[int]) -> None:
+        """With the measured joints in another order."""
+        self.take(*(x[:, list(order)] for x in self._motion))
 
     def scaled(self, joints: Sequence[int], factor: float) -> None:
         """With the positions of these joints times a factor."""
-        self._q[:, list(joints)] *= factor
-        self.moved(range(self._q.shape[1]))
+        for x in self._motion:
+            x[:, list(joints)] *= factor
+        self.take(*self._motion)
+
+    def turned(self, i: int, angle: float) -> None:
+        """With another zero of a joint."""
+        self._motion[0][:, i] += angle
+        self.take(*self._motion)
+
+    def fewer(self, m: int) -> "Contents":
+        """At about m instants."""
+        k = max(len(self.q) // m, 1)
+        other = copy(self)
+        other._some = slice(None, None, k * self._some.step)
+        other._motion = [x[::k].copy() for x in self._motion]
+        other.take(*other._motion)
+        return other
+
+    def is_inside(self) -> bool:
+        """Whether all joints are within their limits, or nearly."""
+        low, high = self.q.min(axis=0), self.q.max(axis=0)
+        room = [ROOM * np.nan_to_num(j.upper - j.lower, posinf=0.0)
+                for j in self.joints]  # fmt: skip
+        inside = np.all(low > np.array([j.lower for j in self.joints]) - room)
+        return bool(
+            inside and np.all(high < np.array([j.upper for j in self.joints]) + room)
+        )
 
     def moves(self, i: int) -> bool:
         """Whether a joint does, by more than its position's grid or noise."""
@@ -284,7 +308,6 @@ def by_content(
     What a sidecar said stays as it is."""
     said: list[Said] = []
     matches = _without_empty(columns, matches, said)
-    matches = _within_limits(joints, columns, matches, said)
     try:
         contents = Contents(plant, joints, columns, matches)
     except TooShort as error:
@@ -292,11 +315,11 @@ def by_content(
         return matches, said
     except ValueError:
         return matches, said
-    matches, contents = _in_units_by_speeds(contents, matches, said)
-    matches, contents = _rightly_timed(contents, matches, said)
     matches = _rightly_signed(contents, matches, said)
     _without_weight(contents, matches, said)
     matches = _rightly_ordered(contents, matches, said)
+    matches = _all_ordered(contents, matches, said)
+    matches = _from_their_zeros(contents, matches, said)
     matches = _drives_that_drive(contents, matches, said)
     matches = _in_turns(contents, matches, said)
     return _with_factors(contents, matches, said), said
@@ -335,109 +358,7 @@ def _without_empty(columns, matches: Sequence[Match], said) -> list[Match]:
     return out
 
 
-def _within_limits(joints, columns, matches: Sequence[Match], said) -> list[Match]:
-    """Positions that a whole turn less, or more, brings within the joint's limits."""
-    of, out = {j.name: j for j in joints}, []
-    for m in matches:
-        at, _, what = (m.channel or "").rpartition(".")
-        joint = of.get(at)
-        own = what in ("position", "position_command") and m.why != AS_SAID
-        if own and joint is not None and np.isfinite(joint.upper - joint.lower):
-            q = without_turns(_si(columns, m))[0]
-            low, high = np.nanmin(q), np.nanmax(q)
-            middle = 0.5 * (joint.lower + joint.upper)
-            turn = TURN * np.rint((0.5 * (low + high) - middle) / TURN)
-            room = 0.1 * (joint.upper - joint.lower)
-            fits = joint.lower - room < low - turn and high - turn < joint.upper + room
-            if turn and fits and not joint.prismatic:
-                says = (
-                    f"Column {m.column} counts from another turn than the limits of "
-                    f"{at}: {-turn / TURN:+.0f} turn"
-                )
-                said.append(Said("position_turns", f"{at}.{what}", turn, f"{says}."))
-                why = f"{m.why}; {-turn / TURN:+.0f} turn, by the joint's limits"
-                m = replace(m, offset=float(m.offset - turn), why=why)
-        out.append(m)
-    return out
-
-
-# ----- What positions and times are counted in
-
-
-def _speed_factors(contents: Contents, matches) -> dict[int, float]:
-    """{joint: rate of its position over its velocity column, as that is taken; but as
-    it is where only its motion told its unit}."""
-    number = {j.name: i for i, j in enumerate(contents.joints)}
-    found = {}
-    for m in matches:
-        at, _, what = (m.channel or "").rpartition(".")
-        if what == "velocity" and at in number:
-            x = contents.of_velocity(m.column, number[at])
-            if x is not None and x.explained > EXPLAINS and contents.moves(number[at]):
-                by_motion = m.why.endswith(BY_DERIVATIVE)
-                found[number[at]] = x.factor / (1.0 if by_motion else m.scale)
-    return found
-
-
-def _in_units_by_speeds(contents: Contents, matches, said):
-    """Angles too large for their joints in the unit that makes their rates the
-    velocities: one of drivers and encoders, the same for all."""
-    mine = [i for i, j in enumerate(contents.joints) if not j.prismatic]
-    factors = _speed_factors(contents, matches)
-    each = np.array([factors[i] for i in mine if i in factors])
-    limits = np.abs(
-        [(contents.joints[i].lower, contents.joints[i].upper) for i in mine]
-    )
-    most = limits.reshape(-1, 2).max(axis=1)
-    most = np.where(np.isfinite(most), most, 10.0 * TURN)
-    if len(each) < len(mine) or not mine or (each <= 0.0).any():
-        return matches, contents
-    if not (np.abs(contents.q[:, mine]).max(axis=0) > 2.0 * most).any():
-        return matches, contents
-    unit = min(_ANGLES, key=lambda u: abs(np.log(u * each[0])))
-    if (np.abs(unit * each - 1.0) > ALIKE).any():
-        return matches, contents
-    names = {contents.joints[i].name for i in mine}
-    out, moved = [], []
-    for m in matches:
-        at, _, what = (m.channel or "").rpartition(".")
-        if "position" in what and at in names and m.why != AS_SAID:
-            why = f"{m.why}; in units of {unit:.6g} rad, by the velocities"
-            m = replace(m, scale=m.scale * unit, offset=m.offset * unit, why=why)
-            moved.append(m.column)
-        out.append(m)
-    says = (
-        f"By the velocities, {', '.join(moved)} are in units of {unit:.6g} rad "
-        f"({np.rad2deg(unit):.4g} deg)."
-    )
-    said.append(Said("position_unit", contents.joints[mine[0]].name, unit, says))
-    return out, contents.at_times(out)
-
-
-def _rightly_timed(contents: Contents, matches, said):
-    """With the unit of time that makes all positions' rates their velocities, where one
-    round number does, and no unit of velocity could."""
-    factors = np.array(list(_speed_factors(contents, matches).values()))
-    time = next(m for m in matches if m.channel == "time")
-    if len(factors) < 2 or time.why == AS_SAID:
-        return matches, contents
-    middle = float(np.median(factors))
-    round_to = min(_TIMES, key=lambda f: abs(np.log(max(middle, 1e-9) / f)))
-    if round_to == 1.0 or (np.abs(factors / round_to - 1.0) > ALIKE).any():
-        return matches, contents
-    scale = time.scale * round_to
-    says = (
-        f"Column {time.column} counts units of {scale:.6g} s: by it, positions change "
-        f"{1.0 / round_to:.6g} times as fast as all velocities say."
-    )
-    why = f"{time.why}; in units of {scale:.6g} s, by positions and velocities"
-    out = [
-        replace(m, scale=scale, why=why) if m is time
-        else replace(m, scale=1.0) if m.why.endswith(BY_DERIVATIVE) else m
-        for m in matches
-    ]  # fmt: skip
-    said.append(Said("time_unit", "time", round_to, says))
-    return out, contents.at_times(out)
+# ----- What angles are counted in, and which way
 
 
 def _misfit(contents: Contents, efforts: Mapping[int, str]) -> float:
@@ -456,20 +377,19 @@ def _in_turns(contents: Contents, matches, said) -> list[Match]:
     before = _misfit(contents, efforts) if efforts and group else -np.inf
     if before < np.log(TOLD_WELL):
         return matches
-    speeds = _speed_factors(contents, matches)
     contents.scaled(group, TURN)
     joints = [contents.joints[i] for i in group]
-    low, high = contents.q[:, group].min(axis=0), contents.q[:, group].max(axis=0)
-    room = np.array([0.1 * np.nan_to_num(j.upper - j.lower) for j in joints])
-    inside = np.all(low > [j.lower for j in joints] - room)
-    inside &= np.all(high < [j.upper for j in joints] + room)
     after = _misfit(contents, efforts)
-    if not inside or after > min(np.log(1.0 - EXPLAINS), before - np.log(2.0)):
+    if not contents.is_inside() or after > min(
+        np.log(1.0 - EXPLAINS), before - np.log(2.0)
+    ):
         contents.scaled(group, 1.0 / TURN)
         return matches
     names = {j.name for j in joints}
-    alike = {contents.joints[i].name for i in group
-             if abs(speeds.get(i, 1.0) - 1.0) < KNOWN_TO}  # fmt: skip
+    speeds = _columns_of(contents, matches, ("velocity",))
+    found = {i: contents.of_velocity(speeds[i], i) for i in group if i in speeds}
+    alike = {contents.joints[i].name for i, x in found.items()
+             if x is not None and abs(x.factor / TURN - 1.0) < KNOWN_TO}  # fmt: skip
     out, moved = [], []
     for m in matches:
         at, _, what = (m.channel or "").rpartition(".")
@@ -480,7 +400,7 @@ def _in_turns(contents: Contents, matches, said) -> list[Match]:
             moved.append(m.column)
         out.append(m)
     says = f"By the efforts that go with them, {', '.join(moved)} are in turns."
-    said.append(Said("position_unit", joints[0].name, TURN, says))
+    said.append(Said("units", joints[0].name, TURN, says))
     return out
 
 
@@ -651,6 +571,80 @@ def _reordered(contents, matches, quantities, order: Sequence[int], said):
     says = f"By what is in them, {word}: {'; '.join(moved)}."
     said.append(Said(kind, f"{names[wrong[0]]}.{quantities[-1]}", len(wrong), says))
     return out
+
+
+def _all_ordered(contents: Contents, matches, said) -> list[Match]:
+    """All of the joints' columns in another order, as arrays without names have them
+    where a driver sorts its joints: that in which the model explains all efforts."""
+    efforts, n = _columns_of(contents, matches, _DRIVES), len(contents.joints)
+    before = _misfit(contents, efforts)
+    if len(efforts) < n or before < np.log(1.0 - EXPLAINS):
+        return matches
+    few = contents.fewer(FEW)
+
+    def left(order: Sequence[int]) -> float:
+        few.moved(order)
+        if not few.is_inside():
+            return 0.0
+        return _misfit(few, {i: efforts[k] for i, k in enumerate(order)})
+
+    order = tuple(range(n))
+    if n <= MOST_ORDERED:
+        order = min(permutations(range(n)), key=left)
+    else:  # By swaps of two.
+        least = np.inf
+        while (now := left(order)) < least:
+            least = now
+            near = []
+            for i, k in combinations(range(n), 2):
+                other = list(order)
+                other[i], other[k] = other[k], other[i]
+                near.append(tuple(other))
+            best = min(near, key=left)
+            order = best if left(best) < least else order
+    contents.moved(order)
+    after = _misfit(contents, {i: efforts[k] for i, k in enumerate(order)})
+    if after > min(np.log(1.0 - EXPLAINS), before - np.log(CLEARER)):
+        contents.moved(range(n))
+        return matches
+    every = ("position", "velocity", *_DRIVES, "position_command", "velocity_command")
+    return _reordered(contents, matches, every, order, said)
+
+
+def _from_their_zeros(contents: Contents, matches, said) -> list[Match]:
+    """With a joint's zero a quarter or half a turn elsewhere, where the model then
+    explains the efforts."""
+    efforts = _columns_of(contents, matches, _DRIVES)
+    before = _misfit(contents, efforts) if efforts else -np.inf
+    if before < np.log(TOLD_WELL):
+        return matches
+    few, found = contents.fewer(FEW), {}
+    mine = _columns_of(contents, matches, ("position",))
+    for i in (i for i in mine if not contents.joints[i].prismatic):
+        for angle in (0.25 * TURN, -0.25 * TURN, 0.5 * TURN, -0.5 * TURN):
+            few.turned(i, angle)
+            if few.is_inside():
+                found[i, angle] = _misfit(few, efforts)
+            few.turned(i, -angle)
+    if not found:
+        return matches
+    i, angle = min(found, key=lambda key: found[key])
+    contents.turned(i, angle)
+    if _misfit(contents, efforts) > min(
+        np.log(1.0 - EXPLAINS), before - np.log(CLEARER)
+    ):
+        contents.turned(i, -angle)
+        return matches
+    at, word = contents.joints[i].name, f"{np.rad2deg(angle):+.0f} deg"
+    says = f"By the efforts, the zero of {mine[i]} is another than that of {at}: taken "
+    says += f"{word}; or what carries it is turned so."
+    said.append(Said("position_zero", f"{at}.position", angle, says))
+    return [
+        replace(m, offset=m.offset + angle, why=f"{m.why}; {word}, by the efforts")
+        if m.channel in (f"{at}.position", f"{at}.position_command")
+        and m.why != AS_SAID else m
+        for m in matches
+    ]  # fmt: skip
 
 
 # ----- What drives a joint

@@ -19,7 +19,8 @@ NAMELESS = "column_"  # What columns without a name are called, with their numbe
 _HEAD = 60  # Lines among which names are looked for.
 # A cell without a number, as programs write it.
 _MISSING = re.compile(
-    rb"(?i)(?<![^,\n])\s*(n/?a|null|none|missing|#n/?a|-+|\?)\s*(?![^,\n])"
+    rb"(?i)(?<![^,\n])\s*(n/?a|null|none|missing|#n/?a|-+|\?|"
+    rb"[+-]?(?:nan\(\w*\)|1\.#(?:qnan|snan|ind)\w*))\s*(?![^,\n])"
 )
 _SHOWN = 3  # Bad rows that are named one by one.
 _QUOTED = re.compile(rb'"([^"\n]*)"')
@@ -74,6 +75,7 @@ class BadRows:
         self._path, self.skip = path, skip
         self.count, self.why = 0, list[str]()
         self.headless = 0  # Columns of a file that does not name them.
+        self.no_rows: dict[str, int] = {}  # {what a line is instead: first of them}
 
     def add(self, why: str) -> None:
         """Raises: ValueError with the reason, unless such rows are left out."""
@@ -91,6 +93,9 @@ class BadRows:
             says = f"{self._path.name} has no header: its columns are called "
             says += f"{NAMELESS}1 to {NAMELESS}{self.headless}"
             found.append(("no_header", says))
+        for what, row in self.no_rows.items():
+            says = f"{self._path.name}: {what} (row {row}): it is left out"
+            found.append(("rows_none", says))
         if not self.count:
             return found
         more = self.count - len(self.why)
@@ -295,7 +300,8 @@ def _list(cell: str) -> list[float] | None:
 
 
 def blocks_of(file, quoted: bool):
-    """Whole lines, 8 MB or so at a time, without empty ones."""
+    """Whole lines, 8 MB or so at a time, without empty ones; only the file's last one
+    may lack its end."""
     rest = b""
     while True:
         block = file.read(_BLOCK)
@@ -306,8 +312,6 @@ def blocks_of(file, quoted: bool):
         text = text.replace(b"\r\n", b"\n")
         while b"\n\n" in text or text[:1] == b"\n":
             text = text.replace(b"\n\n", b"\n").removeprefix(b"\n")
-        if text and not text.endswith(b"\n"):
-            text += b"\n"
         if text:
             yield text
         if not block:
@@ -319,11 +323,13 @@ def parse(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Numbers (rows, columns) of whole lines, and the number of each row from 1; `done`
     rows came before them."""
-    names = dialect.columns()
+    names, is_cut = dialect.columns(), not text.endswith(b"\n")
+    text += b"\n" if is_cut else b""
     if dialect.stamped:
         text = _in_seconds(text)
     if dialect.lists:
-        return _by_line(dialect, names, text.decode(errors="replace"), done, bad, True)
+        lines = text.decode(errors="replace")
+        return _by_line(dialect, names, lines, done, bad, True, is_cut)
     plain = text
     if dialect.separator == " ":
         plain = b"".join(b" ".join(x.split()) + b"\n" for x in text.splitlines())
@@ -353,7 +359,8 @@ def parse(
     except (ValueError, UnicodeDecodeError):
         pass
     # Something is wrong with this block: found at leisure.
-    return _by_line(dialect, names, filled.decode(errors="replace"), done, bad, False)
+    lines = filled.decode(errors="replace")
+    return _by_line(dialect, names, lines, done, bad, False, is_cut)
 
 
 def _unquoted(cell: bytes, dialect: Dialect) -> bytes:
@@ -362,9 +369,10 @@ def _unquoted(cell: bytes, dialect: Dialect) -> bytes:
 
 def _by_line(
     dialect: Dialect, names: Sequence[str], text: str, done: int, bad: BadRows,
-    as_written: bool,
+    as_written: bool, is_cut: bool,
 ):  # fmt: skip
-    """Args: as_written: with the file's own separators and quotes; else made plain."""
+    """Args: as_written: with the file's own separators and quotes; else made plain.
+    is_cut: whether the last line has no end."""
     split: Callable[[str], list[str]]
     n = len(dialect.names)
     if as_written:
@@ -376,9 +384,16 @@ def _by_line(
         def split(line: str) -> list[str]:
             return line.split(",")
 
-    rows, numbers = [], []
-    for i, line in enumerate(text.splitlines()):
+    rows, numbers = list[list[float]](), list[int]()
+    lines = text.splitlines()
+    for i, line in enumerate(lines):
         cells, row = split(line), done + i + 1
+        if [cell.strip() for cell in cells] == [*dialect.names]:
+            bad.no_rows.setdefault("the header comes again", row)
+            continue
+        if is_cut and i == len(lines) - 1 and len(cells) < n:
+            bad.no_rows["the last row is cut"] = row
+            continue
         if len(cells) != n:
             bad.add(f"row {row} has {len(cells)} cells, expected {n} as the header")
             continue

@@ -8,7 +8,7 @@ import numpy as np
 
 from makebreak.gap.data.csv_table import BadRows, text_columns
 from makebreak.gap.data.proposal import find_time
-from makebreak.gap.data.stamps import mended
+from makebreak.gap.data.stamps import is_part_of, mended, whole_stamp
 from makebreak.gap.data.table import MOST_CELLS, RecordingTable, is_text, read_table
 
 
@@ -27,7 +27,11 @@ def read_joined(
     Raises: ValueError, one line.
     """
     names = sidecar.get("columns") or {}
-    unused = frozenset(str(name) for name, to in names.items() if to is None)
+    timed = _time_column(names)
+    unused = frozenset(
+        str(name) for name, to in names.items()
+        if to is None and not is_part_of(timed, str(name))
+    )  # fmt: skip
     tables, text = [], dict[str, str]()
     for file in (path, *(sidecar.get("join") or ())):
         own = {name.removeprefix(f"{file.name}:") for name in unused}
@@ -36,7 +40,14 @@ def read_joined(
             text |= {n if n not in text else f"{file.name}:{n}": x
                      for n, x in more.items()}  # fmt: skip
             own |= {*more}
-        tables.append((file, read_table(file, most_cells, bad, frozenset(own))))
+        table = read_table(file, most_cells, bad, frozenset(own))
+        stamp = whole_stamp(table.columns)
+        if stamp is not None and (timed == stamp[0] or timed not in table.columns):
+            columns = {stamp[0]: stamp[1], **table.columns}
+            says = f"{file.name}: time is {stamp[0]}, of its seconds and nanoseconds"
+            notes = (*table.notes, ("stamps_of_two_columns", says))
+            table = replace(table, columns=columns, notes=notes)
+        tables.append((file, table))
     if len(tables) == 1:
         return tables[0][1], text
     return joined(*tables[0], tables[1:], _time_column(names)), text

@@ -31,14 +31,10 @@ from makebreak.gap.data.findings import (
     Finding,
 )
 from makebreak.gap.data.joined import read_joined
+from makebreak.gap.data.match import AS_SAID, JointName, Match
 from makebreak.gap.data.proposal import (
-    AS_SAID,
     CURRENT,
-    FULL_RANGE,
-    IN_DEGREES,
     UNKNOWN_JOINT,
-    JointName,
-    Match,
     of_one_drive,
     propose,
     said_of,
@@ -56,6 +52,7 @@ from makebreak.gap.data.table import (
     is_channel,
     stem_of,
 )
+from makebreak.gap.data.units import DEG, FULL_RANGE, said_of_units
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.joints import ROTOR
 from makebreak.models.effects.kind import actuator_of, one_dof_joints
@@ -381,6 +378,8 @@ def judge_logs(robot: Robot, logs: Sequence[Log]) -> Judged:
         )
         said.append(Said(BASE_MOVES, robot.bases[0], pose.turned, says))
     said += _maybe_of_a_range(logs, every)
+    for matches in every.values():
+        said += [Said(*each) for each in said_of_units(matches)]
     fixed = _standing(robot, every, logs, bool(unused))
     if fixed:
         robot = _with_fixed(robot, fixed)
@@ -398,7 +397,7 @@ def _maybe_of_a_range(logs: Sequence[Log], every) -> list[Said]:
     """Of LeRobot's positions in degrees, which may be per cent of a range."""
     said = []
     for log in logs:
-        mine = [m for m in every[log.path] if m.why.endswith(IN_DEGREES)]
+        mine = [m for m in every[log.path] if m.scale == DEG and m.told]
         most = [np.nanmax(np.abs(log.table.columns[m.column])) for m in mine]
         if is_dataset(log.path) and mine and not log.ranges and max(most) <= FULL_RANGE:
             says = (
@@ -407,7 +406,7 @@ def _maybe_of_a_range(logs: Sequence[Log], every) -> list[Said]:
                 "(.json) into the dataset's folder, or name it in the sidecar: "
                 "calibration: FILE."
             )
-            said.append(Said("position_unit", str(mine[0].channel), 0.0, says))
+            said.append(Said("units", str(mine[0].channel), 0.0, says))
     return said
 
 

@@ -5,6 +5,7 @@ does not fit the motion is left out with its row. Rows of one stamp are one row,
 where most stamps are shared, stamps are coarser than rows and spread.
 """
 
+import re
 from bisect import bisect_right
 from collections.abc import Mapping
 
@@ -31,6 +32,13 @@ def mended(
         says = f"{name}: {(~known).sum()} rows have no time and are left out"
         notes.append(("stamps_missing", says))
         columns, row = {k: y[known] for k, y in columns.items()}, row[known]
+    values = [y for k, y in columns.items() if k not in (time, "episode")]
+    off = np.all([(y == 0.0) | np.isnan(y) for y in values], axis=0)
+    off &= np.cumsum(~off) == 0
+    if values and _AROUND < off.sum() < len(off):
+        says = f"{name}: {off.sum()} rows at the start have zero throughout, as before "
+        notes.append(("rows_of_zeros", f"{says}power is on: they are left out"))
+        columns, row = {k: y[~off] for k, y in columns.items()}, row[~off]
     t, own = columns[time], columns.get("episode", np.zeros(len(row)))
     if (np.diff(t)[np.diff(own) == 0] > 0.0).all():
         return columns, row, notes
@@ -73,6 +81,28 @@ def mended(
         says = f"{name}: {others} rows have the stamp of the row before and other "
         notes.append(("stamps_twice", f"{says}values: the first of each is used"))
     return columns, row, notes
+
+
+def whole_stamp(columns: Mapping[str, np.ndarray]) -> tuple[str, np.ndarray] | None:
+    """(name, (n,) [s]) of stamps that two columns have the seconds and the nanoseconds
+    of, as ROS messages do."""
+    for name, sec in columns.items():
+        stem = _part_of(name, "secs?")
+        for other in columns if stem is not None else ():
+            if _part_of(other, "n(ano)?secs?") == stem:
+                return stem or "stamp", sec + 1e-9 * columns[other]
+    return None
+
+
+def is_part_of(stamp: str, name: str) -> bool:
+    """Whether a column has the seconds or nanoseconds of a stamp."""
+    return _part_of(name, "(n(ano)?)?secs?") == ("" if stamp == "stamp" else stamp)
+
+
+def _part_of(name: str, unit: str) -> str | None:
+    """What stands before a unit at a name's end; None where none is there."""
+    found = re.fullmatch(rf"(?i)(.*?)[._/ ]?{unit}", name)
+    return found and found.group(1)
 
 
 def _starts(t: np.ndarray) -> np.ndarray:

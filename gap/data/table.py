@@ -280,7 +280,7 @@ def _read_csv(path: Path, most_cells: int, bad: BadRows, unused) -> RecordingTab
             file.seek(body_start)
             parts, rows, done = [], [], 0
             for text in blocks_of(file, dialect.quoted):
-                n = text.count(b"\n")
+                n = text.count(b"\n") + (not text.endswith(b"\n"))
                 if any(a < done + n and b > done for a, b in kept):
                     values, number = parse(dialect, text, done, bad)
                     for a, b in kept:

@@ -8,7 +8,8 @@ import numpy as np
 
 from makebreak.gap.data.bags import is_bag, is_dataset
 from makebreak.gap.data.gathered import gathered
-from makebreak.gap.data.proposal import Match, sidecar_text
+from makebreak.gap.data.match import Match
+from makebreak.gap.data.proposal import sidecar_text
 from makebreak.gap.data.recording_files import ROBOTS, recording_files
 from makebreak.gap.data.robot import (
     Log,
