@@ -155,7 +155,9 @@ class Considered:
 class Trust:
     """A parameter on parts of the data: by recording, over stretches of time, and
     fitted from other starts. NaN where a part does not show it. ridge_with: another
-    parameter of which only a sum with this one shows; "" if there is none."""
+    parameter of which only a sum with this one shows; "" if there is none. correlation:
+    of its error with those of the others that were fitted with it, by their names
+    ("coulomb of joint_coulomb_friction at arm.j1")."""
 
     kind: str
     at: tuple[str, ...]
@@ -167,6 +169,7 @@ class Trust:
     stretches: Sequence[float]
     starts: Sequence[float]
     ridge_with: str = ""
+    correlation: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -159,7 +159,7 @@ def test_a_sidecar_beside_the_scene_serves_a_log_without_its_own(tmp_path):
     near = scene.with_name("log.yaml")
     near.write_text("columns:\n  t: time\n")
     scene.write_text("directives: []\n")
-    known = partial(known_sidecars, out=None, given=None)  # It writes nothing here.
+    known = partial(known_sidecars, file=None, given=None)  # It writes nothing here.
     assert known(scene, [log])[0] == {log: near}
     # Its own wins; a scene is no sidecar, nor is the given one.
     log.with_suffix(".yaml").write_text("columns: {t: time}\n")

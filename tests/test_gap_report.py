@@ -3,6 +3,7 @@
 import json
 import re
 from dataclasses import replace
+from shutil import which
 
 import numpy as np
 import pytest
@@ -15,8 +16,9 @@ from makebreak.gap.data.table import write_recording
 from makebreak.gap.report.clock import extents_of
 from makebreak.gap.report.comparison import comparison_html
 from makebreak.gap.report.files import write_report
+from makebreak.gap.report.interactive import _figure, _library, shown_series
 from makebreak.gap.report.pictures import picture_of_series, picture_of_where
-from makebreak.gap.report.sections import considered
+from makebreak.gap.report.sections import considered, evidence, series
 from makebreak.gap.report.summary import next_best, summary_lines
 from makebreak.gap.result import (
     Considered,
@@ -27,6 +29,7 @@ from makebreak.gap.result import (
     NamedEffect,
     RivalSet,
     Series,
+    Trust,
     Unexplained,
     Where,
 )
@@ -36,6 +39,7 @@ from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, sentence
 from makebreak.models.scene import InitialSection, read_scene
 from makebreak.models.scene_file import write_scene
+from makebreak.scripts.runner.browser import BROWSERS, Browser
 
 COULOMB = Effect("joint_coulomb_friction", ["p.j1"], {"coulomb": 0.35})
 VISCOUS = Effect("joint_viscous_damping", ["p.j1"], {"damping": 0.2})
@@ -156,7 +160,7 @@ def written(case, folder, result=None, **more):
 
 def text_of(page: str) -> str:
     """What a reader sees."""
-    page = re.sub(r"<style>.*?</style>", "", page, flags=re.S)
+    page = re.sub(r"<(style|script)>.*?</\1>", "", page, flags=re.S)
     page = re.sub(r"<[^>]*>", " ", page)
     page = (
         page.replace("&plusmn;", "+-")
@@ -196,6 +200,113 @@ def test_the_page_stands_alone_and_says_it_first(case, tmp_path):
     )
     page = text_of((tmp_path / "report.html").read_text())
     assert f"makebreak run EXPERIMENT --model {tmp_path / 'scene.yaml'}" in page
+
+
+def test_the_plot_holds_what_was_measured_and_simulated_with_breaks_between_windows(
+    case,
+):
+    series = case[2].series
+    shown = shown_series(series)
+    assert {each.channel for each in shown} == set(CHANNELS)
+    figure = _figure(shown, {CHANNELS[0]: "rad"})
+    assert figure["layout"]["annotations"][0]["text"].startswith(shown[0].channel)
+    left = [t for t in figure["data"] if t["xaxis"] == "x" and "name" in t]
+    assert [t["name"] for t in left] == ["measured", "before", "after"]
+    for trace in left[1:]:
+        # A break before each of the twenty windows but the first.
+        breaks = [i for i, y in enumerate(trace["y"]) if y is None]
+        assert len(breaks) == len(trace["y"]) - len(series[0].time) == 19
+        value = getattr(shown[0], trace["name"])
+        y = [y for y in trace["y"] if y is not None]
+        np.testing.assert_allclose(y, value, rtol=1e-5)  # Of six digits.
+    # The errors: what is left fits in, of what was before only a part.
+    low, high = figure["layout"]["yaxis2"]["range"]
+    assert np.abs(shown[0].measured - shown[0].after).max() < high == -low
+    assert np.abs(shown[0].measured - shown[0].before).max() > high
+
+
+def test_a_long_recording_is_shown_about_its_worst_window(case):
+    """Ten thousand rows in windows of 30; the largest error is near the end."""
+    n = 10_000
+    time, measured = np.arange(n) * 0.01, np.zeros(n)
+    measured[9_000] = 1.0
+    zero = np.zeros(n)
+    starts = np.arange(0, n, 30)
+    long = Series("p.j1.position", "r", 0, time, measured, zero, zero, starts, 1e-3)
+    [shown] = shown_series([long])
+    assert len(shown.time) <= 2000 and shown.measured.max() == 1.0
+
+
+@pytest.mark.skipif(not any(map(which, BROWSERS)), reason="no browser")
+def test_a_browser_unpacks_the_plot_and_shows_the_worst_window_when_it_is_clicked(
+    case, tmp_path
+):
+    written(case, tmp_path)
+    with Browser(limit_sec=30.0) as browser:
+        browser.open((tmp_path / "report.html").as_uri())
+        plotted = "document.documentElement.dataset.plotted"
+        browser.run(
+            "new Promise((done) => { const wait = () => "
+            f"{plotted} ? done() : setTimeout(wait, 50); wait(); }})"
+        )
+        assert browser.run("document.querySelectorAll('#series .main-svg').length")
+        assert browser.run("document.querySelectorAll('#series img').length") == 0
+        row = browser.run(
+            "(() => { const row = document.querySelector('a[data-axis]'); row.click();"
+            "return [row.dataset.axis, +row.dataset.from, +row.dataset.to]; })()"
+        )
+        layout = f"document.getElementById('series').layout.xaxis{row[0]}.range"
+        assert browser.run(f"{layout}.map(Number)") == row[1:]
+
+
+def test_effects_are_ranked_by_what_is_lost_without_them(case):
+    """3 over 1 and 9 over 1: half the length on a logarithmic scale."""
+    [one] = case[2].effects
+    less = replace(one, evidence=replace(one.evidence, held_out_before=3.0))
+    more = replace(one, kind="rotor_inertia")
+    two = [
+        replace(e, evidence=replace(e.evidence, held_out_before=x, held_out_after=1.0))
+        for e, x in ((less, 3.0), (more, 9.0))
+    ]
+    page = evidence(replace(case[2], effects=two))
+    assert page.index("rotor_inertia") < page.index(one.kind)
+    assert re.findall(r"width:([\d.]+)%", page) == ["100.0", "50.0"]
+    assert "9 times" in page and "3 times" in page
+    unknown = replace(one, evidence=replace(one.evidence, held_out_before=np.nan))
+    assert evidence(replace(case[2], effects=[unknown])) == ""
+
+
+def test_windows_are_listed_by_the_error_that_is_left(case):
+    """Of three windows of a channel the second is 5 times as far off as expected."""
+    time = np.arange(30) * 0.1
+    zero, measured = np.zeros(30), np.repeat([1e-3, 5e-3, 2e-3], 10)
+    measured[10] = np.nan  # Not measured.
+    before = measured - np.repeat([9e-3, 6e-3, 7e-3], 10)
+    starts = np.array([0, 10, 20])
+    one = Series("p.j1.position", "r", 0, time, measured, before, zero, starts, 1e-3)
+    page = series(replace(case[2], series=[one]), {}, [one])
+    rows = re.findall(r"<td><a .*?>(.*?)</a>.*?<td>([\d.]+)</td></tr>", page)
+    assert rows == [
+        ("1.00 - 1.90 s", "5"), ("2.00 - 2.90 s", "2"), ("0.00 - 0.90 s", "1"),
+    ]  # fmt: skip
+
+
+def test_correlations_of_parameters_are_shown_both_ways(case, tmp_path):
+    def of(name, value, other):
+        return Trust(
+            "joint_coulomb_friction", ("p.j1",), name, "N m", 1.0, 0.1, {}, (), (),
+            correlation={f"{other} of joint_coulomb_friction at p.j1": value},
+        )  # fmt: skip
+
+    both = [of("coulomb", -0.93, "offset"), of("offset", -0.93, "coulomb")]
+    page = written(case, tmp_path, replace(case[2], trust=both))
+    table = page[page.index("Correlation of their errors") :]
+    cells = re.findall(r"<td class=n[^>]*>(.*?)</td>", table.partition("</table>")[0])
+    assert cells == ["1", "-0.93", "-0.93", "1"]
+    written_json = json.loads((tmp_path / "result.json").read_text())
+    assert list(written_json["trust"][0]["correlation"].values()) == [-0.93]
+    alone = written(case, tmp_path / "b", replace(case[2], trust=both[:1]))
+    assert "Correlation of their errors" not in alone
 
 
 def test_stamps_that_count_from_a_date_are_shown_from_the_start(case, tmp_path):
@@ -245,7 +356,8 @@ def test_the_files_are_those_of_the_design(case, tmp_path):
     assert result["verdict"] == "gap_named"
     assert result["effects"][0]["at"] == "p.j1"
     assert read_scene(tmp_path / "scene.yaml").effects == [COULOMB]
-    assert 'href="compare.html"' in (tmp_path / "report.html").read_text()
+    page = (tmp_path / "report.html").read_text()
+    assert 'href="compare.html"' in page and 'src="compare.html#small"' in page
 
 
 def test_effects_that_the_scene_had_are_kept_before_the_new(case, tmp_path):
@@ -357,8 +469,9 @@ def test_a_parameter_that_was_not_fitted_has_no_deviation(case, tmp_path):
 
 def test_text_of_a_recording_is_no_html(case, tmp_path):
     where = replace(case[2].where[0], region="<script>alert(1)</script>", score=1e9)
-    page = written(case, tmp_path, replace(case[2], where=[where]))
-    assert "<script" not in page
+    bad = replace(case[2].series[0], channel="</script><script>alert(1)</script>")
+    page = written(case, tmp_path, replace(case[2], where=[where], series=[bad]))
+    assert "<script>alert" not in page and page.count("<script>") == 1
 
 
 def test_the_heat_map_shows_a_stretch_where_it_was(case):
@@ -389,7 +502,7 @@ def test_many_channels_episodes_and_findings_stay_readable(case, tmp_path):
     )
     page = written(case, tmp_path, result)
     # Pictures hardly grow with the channels, and long tables are folded and cut.
-    assert len(page) < 600_000
+    assert len(page) - len(_library()) < 800_000
     assert "<details>" in page
 
 

@@ -55,7 +55,13 @@ from makebreak.gap.search.drop import _is_certain
 from makebreak.gap.search.screen import Ranked
 from makebreak.gap.search.select import select
 from makebreak.gap.search.trials import pick_simplest, shortlist
-from makebreak.gap.search.trust import consistency, gauss_newton, ridges, scatter
+from makebreak.gap.search.trust import (
+    consistency,
+    correlations,
+    gauss_newton,
+    ridges,
+    scatter,
+)
 from makebreak.gap.thresholds import SAME_ERROR
 from makebreak.gap.verdict import (
     Facts,
@@ -485,6 +491,15 @@ def test_two_parameters_of_which_only_a_sum_shows_are_flagged():
     assert ridges(np.stack([x, x, y], axis=1)).tolist() == [1, 0, -1]  # Exactly.
     assert ridges(np.stack([x, x + y], axis=1)).tolist() == [-1, -1]  # 0.7.
     assert ridges(x[:, None]).tolist() == [-1]
+
+
+def test_errors_of_parameters_are_correlated_as_their_columns_are_not():
+    """Of two columns at 60 degrees: minus their cosine. What is alike goes together."""
+    x, y = np.eye(5)[:2]
+    J = np.stack([x, 3.0 * (0.5 * x + np.sqrt(0.75) * y)], axis=1)
+    np.testing.assert_allclose(correlations(J), [[1, -0.5], [-0.5, 1]], atol=1e-12)
+    alike = correlations(np.stack([x, -2.0 * x, y], axis=1))
+    np.testing.assert_allclose(alike, [[1, 1, 0], [1, 1, 0], [0, 0, 1]], atol=1e-12)
 
 
 def test_a_parameter_on_a_part_of_the_rows_is_that_of_a_fit_of_these():

@@ -475,7 +475,8 @@ def _with_numbers(
         "order": json.dumps(order),
     }
     box = (
-        '<div style="position:fixed;left:14px;bottom:12px;z-index:10;padding:8px 12px;'
+        '<div id="numbers" style="position:fixed;left:14px;bottom:12px;z-index:10;'
+        "padding:8px 12px;"
         "max-width:46em;font:14px/1.5 system-ui,sans-serif;"
         "font-variant-numeric:tabular-nums;background:rgba(255,255,255,.88);"
         f'border-radius:4px">{"<br>".join(lines)}</div>'
@@ -487,7 +488,16 @@ def _with_numbers(
 # moved a little towards the eye before the one that is drawn before it.
 _SCRIPT = """
 const shown = {play: %(play)s, says: %(says)s, order: %(order)s};
+const small = location.hash == "#small";  // Inside the report: the motion alone.
+if (small) {
+  document.getElementById("numbers").style.display = "none";
+  viewer.gui.hide();
+}
 function show() {
+  if (small && viewer.animator.time >= viewer.animator.duration) {
+    viewer.animator.seek(0);
+    viewer.animator.play();
+  }
   const now = viewer.animator.time + 1e-6;
   let k = shown.play.length - 1;
   while (k > 0 && shown.play[k] > now) k -= 1;

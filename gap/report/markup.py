@@ -39,6 +39,11 @@ def section(title: str, body: str) -> str:
     return f"<section><h2>{title}</h2>{body}</section>"
 
 
+def bar(share: float) -> str:
+    """A bar of this share of the full length."""
+    return f'<span class="bar" style="width:{max(100.0 * share, 0.5):.1f}%"></span>'
+
+
 def folded(title: str, body: str) -> str:
     """What is shown when its title is clicked."""
     return f"<details><summary>{title}</summary>{body}</details>"
@@ -99,6 +104,10 @@ td,th{text-align:left;padding:3px 16px 3px 0;border-bottom:1px solid #edf2f7;
 th{color:#718096;font-weight:500}
 pre{background:#f7fafc;border:1px solid #e2e8f0;border-radius:4px;padding:8px 12px;
  margin:2px 0 10px;white-space:pre-wrap;overflow-wrap:anywhere;font-size:13px}
+.bars{width:100%}.bars td:nth-child(2){width:50%}
+.bar{display:inline-block;height:12px;background:#2b6cb0;border-radius:2px}
+a[data-axis]{color:#2b6cb0;cursor:pointer}
+iframe{width:100%;height:230px;border:1px solid #e2e8f0;border-radius:4px}
 summary{cursor:pointer;color:#2b6cb0;font-size:14px;margin:4px 0}
 li.error{color:#c53030}li.warning{color:#975a16}
 """

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from makebreak.gap.data.recording import Recording
 from makebreak.gap.report import sections
+from makebreak.gap.report.interactive import shown_series
 from makebreak.gap.report.markup import STYLE, image, sentence_html
 from makebreak.gap.report.summary import (
     closed_share,
@@ -34,9 +35,11 @@ def report_html(
         others: as of files.write_report.
     """
     heading, _ = heading_of(result)
+    first = _first_screen(result, pictures, has_comparison)
     below = [
+        sections.evidence(result),
         sections.where(result, pictures, recordings),
-        sections.series(result, pictures),
+        sections.series(result, pictures, shown_series(result.series)),
         sections.in_units(result),
         sections.trust(result, pictures),
         sections.tried(result),
@@ -53,13 +56,15 @@ def report_html(
         '<meta name="viewport" content="width=device-width">'
         f"<title>{escape(heading)} - makebreak gap</title>"
         f"<style>{STYLE}</style></head>\n<body><main>\n"
-        f'<section class="first">{_first_screen(result, pictures)}</section>\n'
+        f'<section class="first">{first}</section>\n'
         + "\n".join(each for each in below if each)
         + "\n</main></body></html>\n"
     )
 
 
-def _first_screen(result: GapResult, pictures: Mapping[str, bytes]) -> str:
+def _first_screen(
+    result: GapResult, pictures: Mapping[str, bytes], has_comparison: bool
+) -> str:
     """The verdict, its effects, and how much of the gap they close."""
     heading, colour = heading_of(result)
     says = "Held-out error of each channel, before and after"
@@ -73,9 +78,18 @@ def _first_screen(result: GapResult, pictures: Mapping[str, bytes]) -> str:
         "</div><div>",
         _numbers(result),
         image(pictures, "channels", says),
+        _MOVING if has_comparison else "",
         "</div></div>",
     ]
     return "".join(parts)
+
+
+# The animation without its controls: comparison.py knows `#small`.
+_MOVING = (
+    '<iframe src="compare.html#small" title="Measured (grey), before (orange), after '
+    '(blue)"></iframe><p class="small"><a href="compare.html">The animation</a>: '
+    "measured (grey), before (orange), after (blue).</p>"
+)
 
 
 def _doubts(result: GapResult) -> str:

@@ -166,14 +166,18 @@ def _time_ticks(axes, spans, starts, bins) -> None:
             )  # fmt: skip
 
 
+def measured_channels(series: Sequence[Series]) -> list[Series]:
+    """Those that were measured at all, the one with the largest error before first."""
+    measured = [each for each in series if np.isfinite(each.measured).any()]
+    return sorted(measured, key=lambda each: -_rms_before(each))
+
+
 def picture_of_series(
     series: Sequence[Series], units: Mapping[str, str] | None = None, most: int = 3
 ) -> Figure | None:
     """Measured channels over neighbouring held-out windows: measured, before and after,
     and the errors beside what a perfect model would leave. units: of channels."""
-    measured = [each for each in series if np.isfinite(each.measured).any()]
-    worst = sorted(measured, key=lambda each: -_rms_before(each))[:most]
-    worst = [_stretch(each) for each in worst]
+    worst = [stretch(each) for each in measured_channels(series)[:most]]
     if not worst:
         return None
     figure = Figure(figsize=(10.0, 2.5 * len(worst) + 0.4), layout="constrained")
@@ -185,16 +189,16 @@ def picture_of_series(
             (each.before, BEFORE, "before"),
             (each.after, AFTER, "after"),
         ):
-            gapped_t, gapped = _broken(t, value, each.starts)
+            gapped_t, gapped = broken(t, value, each.starts)
             left.plot(gapped_t, gapped, color=colour, lw=1.3, label=label)
             # Between rows of a channel others may have rows: no break of the line.
             rows = np.flatnonzero(np.isfinite(each.measured))
             error = (each.measured - value)[rows]
             starts = np.searchsorted(rows, each.starts)
-            gapped_t, gapped = _broken(t[rows], error, starts)
+            gapped_t, gapped = broken(t[rows], error, starts)
             right.plot(gapped_t, gapped, color=colour, lw=1.0, label=label)
-        expected = _expected(each)
-        band_t, band = _broken(t, 2.0 * expected, each.starts)
+        expected = expected_of(each)
+        band_t, band = broken(t, 2.0 * expected, each.starts)
         right.fill_between(band_t, -band, band, color="0.88", lw=0)
         right.axhspan(-2.0 * each.noise, 2.0 * each.noise, color="0.72", lw=0)
         left.set_title(
@@ -218,27 +222,28 @@ def picture_of_series(
     return figure
 
 
-def _stretch(each: Series) -> Series:
-    """The windows about the one with the largest error: of more nothing is seen."""
+def stretch(each: Series, most: int = _MOST_WINDOWS) -> Series:
+    """At most so many windows, about the one with the largest error: of more nothing is
+    seen."""
     n = len(each.time)
     cuts = [0, *sorted({int(s) for s in each.starts if 0 < s < n}), n]
-    if len(cuts) - 1 <= _MOST_WINDOWS:
+    if len(cuts) - 1 <= most:
         return each
     error = np.nan_to_num((each.measured - each.before) ** 2)
     sizes = [error[a:b].mean() for a, b in pairwise(cuts)]
-    first = int(np.argmax(sizes)) - _MOST_WINDOWS // 2
-    first = min(max(first, 0), len(sizes) - _MOST_WINDOWS)
-    a, b = cuts[first], cuts[first + _MOST_WINDOWS]
+    first = int(np.argmax(sizes)) - most // 2
+    first = min(max(first, 0), len(sizes) - most)
+    a, b = cuts[first], cuts[first + most]
     starts = np.array([s - a for s in cuts if a <= s < b])
     parts = (each.time, each.measured, each.before, each.after)
     time, measured, before, after = (part[a:b] for part in parts)
     return replace(
         each, time=time, measured=measured, before=before, after=after, starts=starts,
-        expected=_expected(each)[a:b],
+        expected=expected_of(each)[a:b],
     )  # fmt: skip
 
 
-def _expected(each: Series) -> np.ndarray:
+def expected_of(each: Series) -> np.ndarray:
     """(n,) of a series, the noise where nothing else is known."""
     if each.expected is None:
         return np.full(len(each.time), each.noise)
@@ -302,7 +307,7 @@ def _plain_numbers(axis) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def _broken(t, value, starts):
+def broken(t, value, starts):
     """With a break before each window: it starts anew from what was measured."""
     cuts = [int(s) for s in starts if 0 < s < len(t)]
     return np.insert(t, cuts, np.nan), np.insert(value, cuts, np.nan)

@@ -3,6 +3,7 @@ nothing for them. `pictures` are PNG files by name."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
+from itertools import pairwise
 from pathlib import Path
 from shlex import quote
 
@@ -10,12 +11,40 @@ import numpy as np
 
 from makebreak.gap.data.recording import Recording
 from makebreak.gap.report.clock import zeros_of
-from makebreak.gap.report.markup import cell, folded, image, section, table
+from makebreak.gap.report.interactive import axis_of, series_html
+from makebreak.gap.report.markup import bar, cell, folded, image, section, table
+from makebreak.gap.report.pictures import expected_of
 from makebreak.gap.report.summary import number, together, windows_of
-from makebreak.gap.result import GapResult, InUnits, Where, plain
+from makebreak.gap.result import GapResult, InUnits, Series, Where, plain
 
 _SEVERITIES = ("error", "warning", "info")
+_MOST_CORRELATED = 12
 _MOST_TOLERANCES = 2.0  # Of a nuisance parameter: farther off, its model is doubtful.
+
+
+def evidence(result: GapResult) -> str:
+    """The effects by how much larger the held-out error is without each."""
+    known = []
+    for each in result.effects:
+        before, after = each.evidence.held_out_before, each.evidence.held_out_after
+        if np.isfinite(before) and np.isfinite(after) and after > 0.0:
+            known.append((before / after, each))
+    if not known:
+        return ""
+    known.sort(key=lambda item: -item[0])
+    longest = max(known[0][0], 1.0 + 1e-9)
+    rows = "".join(
+        f"<tr><td>{escape(each.kind)} at {escape(', '.join(each.at))}</td>"
+        f"<td>{bar(np.log(max(ratio, 1.0)) / np.log(longest))}</td>"
+        f"<td class=n>{number(ratio)} times</td></tr>"
+        for ratio, each in known
+    )
+    note = (
+        '<p class="small">Held-out error without an effect, all others being in the '
+        "model, over the error with it; bars on a logarithmic scale.</p>"
+    )
+    title = "What each effect explains"
+    return section(title, f"{note}<table class=bars>{rows}</table>")
 
 
 def where(
@@ -59,16 +88,56 @@ def where(
     return section("Where", picture + note + table(heads, rows, most=6))
 
 
-def series(result: GapResult, pictures: Mapping[str, bytes]) -> str:
-    """What was measured, beside the simulation before and after."""
-    if "series" not in pictures:
+def series(
+    result: GapResult, pictures: Mapping[str, bytes], shown: Sequence[Series]
+) -> str:
+    """What was measured, beside the simulation before and after. shown: of
+    interactive.shown_series."""
+    if not shown:
         return ""
     note = '<p class="small">Held-out data.'
     if result.gap.window_s > 0.0:
         note += " Each window starts from a measured state."
-    note += "</p>"
+    note += (
+        " Drag to zoom, all channels together; click twice to see all. The errors are "
+        "shown at the scale of those after; click on a name to hide its lines.</p>"
+    )
+    units = {c: u.unit for c, u in result.gap.in_units.items()}
     picture = image(pictures, "series", "Measured and simulated, before and after")
-    return section("Measured, before, after", picture + note)
+    plot = series_html(shown, units, picture)
+    return section("Measured, before, after", note + plot + _worst_windows(shown))
+
+
+def _worst_windows(shown: Sequence[Series]) -> str:
+    """The windows with the largest error that is left, of the channels that are shown;
+    a click on one shows it in the plot."""
+    found: list[tuple[float, float, float, float, int, Series]] = []
+    for k, each in enumerate(shown):
+        cuts = [0, *sorted({int(s) for s in each.starts if s > 0}), len(each.time)]
+        over = expected_of(each)
+        errors = [((each.measured - x) / over) ** 2 for x in (each.after, each.before)]
+        for a, b in pairwise(cuts):
+            if np.isfinite(errors[0][a:b]).any():
+                known = [e[a:b][np.isfinite(e[a:b])] for e in errors]
+                after, before = (
+                    float(np.mean(e)) ** 0.5 if len(e) else np.nan for e in known
+                )
+                span = float(each.time[a]), float(each.time[b - 1])
+                found.append((after, before, *span, k, each))
+    worst = sorted(found, key=lambda w: -w[0])[:6]
+    rows = "".join(
+        f"<tr><td>{escape(each.channel)}</td><td><a data-axis='{axis_of(k)}' "
+        f"data-from={start} data-to={end}>{start:.2f} - {end:.2f} s</a> of "
+        f"{escape(each.recording)}, episode {each.episode}</td>"
+        f"<td>{number(before)}</td><td>{number(after)}</td></tr>"
+        for after, before, start, end, k, each in worst
+    )
+    heads = "".join(
+        f"<th>{each}</th>"
+        for each in ("channel", "window", "error / expected, before", "after")
+    )
+    says = "Worst windows after"
+    return f"<h3>{says}</h3><table><tr>{heads}</tr>{rows}</table>" if rows else ""
 
 
 def tried(result: GapResult) -> str:
@@ -205,9 +274,40 @@ def trust(result: GapResult, pictures: Mapping[str, bytes]) -> str:
         "others unchanged), and from other initial values.</p>"
     )
     picture = image(pictures, "trust", "Each parameter on parts of the data")
-    return section(
-        "How certain the parameters are", picture + note + table(heads, rows, most=12)
+    body = picture + note + table(heads, rows, most=12) + _correlations(result)
+    return section("How certain the parameters are", body)
+
+
+def _correlations(result: GapResult) -> str:
+    """Of the errors of parameters that were fitted together: a coloured table."""
+    names = [f"{t.parameter} of {t.kind} at {', '.join(t.at)}" for t in result.trust]
+    shown = [k for k, t in enumerate(result.trust) if t.correlation]
+    shown = shown[:_MOST_CORRELATED]
+    if len(shown) < 2:
+        return ""
+    rows = ""
+    for k in shown:
+        cells = ""
+        for j in shown:
+            value = result.trust[k].correlation.get(names[j], np.nan)
+            tint = f' style="background:rgba({_tint(value)})"' if value == value else ""
+            text = "1" if j == k else "-"
+            if value == value and j != k:
+                text = f"{round(value, 2) + 0.0:.2f}"  # No minus before a zero.
+            cells += f"<td class=n{tint}>{text}</td>"
+        rows += f"<tr><td>{shown.index(k) + 1}. {escape(names[k])}</td>{cells}</tr>"
+    heads = "".join(f"<th>{i + 1}</th>" for i in range(len(shown)))
+    note = (
+        '<p class="small">Correlation of their errors: of two near 1 or -1 these data '
+        "determine one combination only.</p>"
     )
+    return f"{note}<table><tr><th></th>{heads}</tr>{rows}</table>"
+
+
+def _tint(value: float) -> str:
+    """Blue for the one sign and orange for the other, stronger the nearer to one."""
+    rgb = "43,108,176" if value > 0.0 else "217,128,50"
+    return f"{rgb},{0.75 * abs(value):.2f}"
 
 
 def _range(values: Iterable[float]) -> str:

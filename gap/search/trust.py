@@ -48,14 +48,14 @@ def trust_in(
     }
     stretches = [value + gauss_newton(J, r, some, known) for some in stretches_of]
     starts = [_from_elsewhere(problem, screen, fitted, fixed, s) for s in STARTS]
-    ridge = ridges(fitted.J)
+    ridge, alike = ridges(fitted.J), correlations(fitted.J)
+    names = [f"{name} of {called(fitted.effects[i])}" for i, name in fitted.names]
     found = []
     for k, (i, name) in enumerate(fitted.names):
         effect = fitted.effects[i]
         other = ""
         if ridge[k] >= 0:
-            j, its = fitted.names[ridge[k]]
-            other = f"{its} of {called(fitted.effects[j])}"
+            other = names[ridge[k]]
         found.append(
             Trust(
                 effect.kind, tuple(effect.at), name,
@@ -68,6 +68,7 @@ def trust_in(
                 tuple(float(of[k]) for of in stretches),
                 tuple(float(of[i][name]) for of in starts if of is not None),
                 other,
+                {n: float(alike[k, j]) for j, n in enumerate(names) if j != k},
             )
         )  # fmt: skip
     return found
@@ -275,18 +276,26 @@ def _with_known(
     return np.vstack([A, weight * J[:, shown]]), np.append(y, weight * r)
 
 
-def ridges(J: np.ndarray) -> np.ndarray:
-    """(k,) of each parameter the other with which its errors go together so closely
-    that only a sum of the two shows; -1 where there is none. J (m, k)."""
+def correlations(J: np.ndarray) -> np.ndarray:
+    """(k, k) of the errors of the parameters with columns J (m, k). Of columns that are
+    alike the inverse has no variance in the direction that does not show."""
     k = J.shape[1]
     size = np.linalg.norm(J, axis=0)
     size[size == 0.0] = 1.0
     A = J / size
     C = np.linalg.pinv(A.T @ A, rcond=1e-14, hermitian=True)
     std = np.sqrt(np.maximum(np.diag(C), 1e-300))
-    R = np.abs(C / std[:, None] / std) - np.eye(k)
-    # A truncated direction has no variance in the inverse: it is a ridge all the same.
-    R = np.maximum(R, np.abs(A.T @ A) - np.eye(k))
+    R, alike = C / std[:, None] / std, A.T @ A
+    R = np.where(np.abs(alike) > RIDGE, -alike, R)
+    R[np.diag_indices(k)] = 1.0
+    return R
+
+
+def ridges(J: np.ndarray) -> np.ndarray:
+    """(k,) of each parameter the other with which its errors go together so closely
+    that only a sum of the two shows; -1 where there is none. J (m, k)."""
+    R, k = np.abs(correlations(J)), J.shape[1]
+    np.fill_diagonal(R, 0.0)
     out = np.full(k, -1)
     if k > 1:
         best = np.argmax(R, axis=1)
