@@ -577,8 +577,8 @@ def _all_ordered(contents: Contents, matches, said) -> list[Match]:
     """All of the joints' columns in another order, as arrays without names have them
     where a driver sorts its joints: that in which the model explains all efforts."""
     efforts, n = _columns_of(contents, matches, _DRIVES), len(contents.joints)
-    before = _misfit(contents, efforts)
-    if len(efforts) < n or before < np.log(1.0 - EXPLAINS):
+    before = _misfit(contents, efforts) if len(efforts) == n else -np.inf
+    if before < np.log(1.0 - EXPLAINS):
         return matches
     few = contents.fewer(FEW)
 
