@@ -90,7 +90,7 @@ def test_mondays_sidecar_serves_fridays_log_and_it_is_said(folder, capsys):
     scene.parent.mkdir()
     scene.write_text("directives: []\n")
     with OutputFolder(folder / "out", "gap") as files:
-        found, notes = known_sidecars(scene, [log], files, None)
+        found, notes = known_sidecars(scene, [log], files.file, None)
         assert yaml.safe_load(found[log].read_text()) == {
             "columns": yaml.safe_load(SIDECAR)["columns"]
         }
