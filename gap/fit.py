@@ -62,8 +62,30 @@ def fit_effects(
         rows = np.append(rows, problem.prior_rows(free.effects(z)))
         return np.where(np.isfinite(rows), rows, 1e6)
 
+    sets = problem.apart(start, free.names)
+    masks = [problem.moved_by(start[i]) for i, _ in free.names] if sets else []
+
+    def slopes(z) -> np.ndarray:
+        """(n, k) of the cost's rows, of sets of parameters at once."""
+        r, rows = residual(z), cost(z)
+        J = np.zeros((len(rows), len(z)))
+        h = problem.plan.diff_step * np.maximum(np.abs(z), 0.3)
+        h = np.where(z + h > free.high / scale, -h, h)
+        for some in sets:
+            moved = np.array(z)
+            moved[some] += h[some]
+            try:
+                off = residual(moved) - r
+            except (ValueError, RuntimeError):
+                continue
+            for k in some:
+                there = screen.cost_rows(r + np.where(masks[k], off, 0.0))
+                J[: len(there), k] = (there - rows[: len(there)]) / h[k]
+        return J
+
     solved = least_squares(
-        cost, x0 / scale, bounds=(low / scale, free.high / scale),
+        cost, x0 / scale, slopes if sets else "2-point",
+        bounds=(low / scale, free.high / scale),
         diff_step=problem.plan.diff_step, x_scale=1.0, xtol=1e-6,
         ftol=1e-6 if steps > SHORT else 1e-4, max_nfev=steps,
     ) if len(x0) else None  # fmt: skip
@@ -135,15 +157,18 @@ def tangents(
     of its typical size."""
     free = _Free(problem, fitted.effects, [tuple(names) for names in fixed])
     z, columns = free.x0 / free.scale, []
-    for k in range(len(z)):
+    sets = problem.apart(fitted.effects, free.names)
+    for some in sets or [[k] for k in range(len(z))]:
         go_on()
         moved = np.array(z)
-        moved[k] += problem.plan.diff_step
+        moved[some] += problem.plan.diff_step
         try:
-            r = problem.residual(free.effects(moved))
+            off = problem.residual(free.effects(moved)) - fitted.r
         except (ValueError, RuntimeError):
             continue
-        columns.append((r - fitted.r) / problem.plan.diff_step)
+        for k in some:
+            mine = problem.moved_by(fitted.effects[free.names[k][0]])
+            columns.append(np.where(mine, off, 0.0) / problem.plan.diff_step)
     if not columns:
         return np.zeros((len(fitted.r), 0))
     return np.stack(columns, axis=1)
@@ -211,7 +236,7 @@ class _Free:
             for name in effect.parameters
             if name not in fixed[i]
         ]
-        self.scale = np.array([_scale(start[i], name) for i, name in self.names])
+        self.scale = np.array([size_of(start[i], name) for i, name in self.names])
         least = [problem.dynamics.least(e.kind, e.at) for e in start]
         self.low = np.array(
             [
@@ -263,7 +288,8 @@ def _n_rows(screen: Screen) -> int:
     return len(screen.cost_rows(screen.r))
 
 
-def _scale(effect: Effect, name: str) -> float:
+def size_of(effect: Effect, name: str) -> float:
+    """A typical size of a parameter, in which a fit moves it."""
     value = abs(effect.parameters[name])
     unit = KINDS[effect.kind].parameter(name).unit
     typical = {"rad": 0.1, "s": 0.01, "m": 0.05, "s/s": 1e-3, "kg": 0.1}.get(unit, 0.0)

@@ -32,8 +32,9 @@ class SearchPlan:
     jumps: whether errors jump with the parameters, so that searches without slopes are
     needed. least_gain: what an effect must take off the error, as a share of it.
     least_error: below it nothing tells two models apart. most_effects: that are named.
-    own_values: whether a value that joints share may become one for each.
     shortlist: candidates that are fitted exactly before one is taken.
+    alike: whether joints of a robot are: what all have is no less likely than what one
+        has.
     simulation_agrees: whether agreement also needs simulated windows that agree.
     loud: rms over noise of one channel that is a gap, whatever the others leave.
     """
@@ -45,8 +46,8 @@ class SearchPlan:
     least_error: float = 0.0
     most_effects: int = 4
     by_channel: bool = False
-    own_values: bool = False
     shortlist: int = 8
+    alike: bool = False
     simulation_agrees: bool = False
     loud: float = 3.0
 
@@ -341,18 +342,22 @@ class GapProblem(ABC):
         was fitted by others may be refused."""
         return list(effects)
 
-    def column(
-        self, effects: Sequence[Effect], k: int, name: str, r: np.ndarray
-    ) -> np.ndarray:
-        """(m,) what more of a parameter of effect k takes off the residual r (m,)."""
-        raise NotImplementedError
+    def rich(self) -> Sequence[Effect]:
+        """Effects of one parameter at many joints, fitted roughly, from which a search
+        starts; none: from nothing."""
+        return ()
 
-    def own_values(
-        self, effects: Sequence[Effect], k: int, r: np.ndarray
-    ) -> dict[str, np.ndarray]:
-        """{joint: (m,) what more of its value there takes off r (m,)} of the joints
-        that share the value of effect k; none where none could have its own."""
-        return {}
+    def apart(
+        self, effects: Sequence[Effect], names: Sequence[tuple[int, str]]
+    ) -> list[list[int]]:
+        """Parameters, (number of its effect, name), in sets that are moved at once to
+        see what each does to rows that only it moves (`moved_by`); none where each is
+        moved by itself."""
+        return []
+
+    def moved_by(self, effect: Effect) -> np.ndarray:
+        """(m,) which rows an effect moves, where sets are moved at once."""
+        return np.ones(len(self.train()), bool)
 
     def weighed_alike(
         self, one: Sequence[Effect], other: Sequence[Effect]

@@ -140,10 +140,6 @@ DIFFERS_SHARE = 0.3
 # derivatives before one is chosen, with so many simulations each.
 FINALISTS = 4
 FINALIST_SIMULATIONS = 80
-# Joints that get a value of their own in the place of one that all share, and how many
-# are fitted for each.
-OWN_VALUES_MAX = 8
-OWN_VALUES_TRIED = 3
 
 # ----- The verdict
 

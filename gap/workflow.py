@@ -117,6 +117,7 @@ from makebreak.models.effects.kind import (
 )
 from makebreak.models.scene import Scene, read_scene
 
+ProblemOf = Callable[..., tuple[GapProblem, list[Finding]]]
 # Of longer recordings of a mechanism, and of more rows of anything, pieces are used.
 MOST_SEC, MOST_ROWS = 60.0, 120_000
 # Of what is only reported on.
@@ -279,6 +280,21 @@ def _compared(
             result = in_equations_alone(problem, selection, checks)
     seconds["simulate"] = clock.lap()
 
+    def in_another_way() -> tuple[GapProblem, Selection, GapResult]:
+        """What windows do not name, equations may; and the reverse."""
+        first = problem, selection, result
+        say("preparing another comparison")
+        try:
+            other, found = other_problem(problem, scene, decided, dynamics, jobs)
+        except DoesNotFit:
+            return first
+        say("searching the catalogue in another way")
+        then = select(other, say)
+        named = conclude(other, then, reported, [*checks, *found], jobs)
+        if named.verdict in ("gap_unnamed", "not_judged"):
+            return first
+        return other, then, named
+
     def between_impacts(problem: FlightProblem) -> GapResult:
         between = problem.between_impacts() if unnamed else None
         if between is None:
@@ -296,7 +312,7 @@ def _compared(
         say(f"searching {name} separately")
         mine, its = ([r for r in some if r.name == name]
                      for some in (decided, reported))  # fmt: skip
-        one, _ = problem_for(scene, mine, dynamics, jobs, meets)
+        one, _ = again(scene, mine, dynamics, jobs)
         selected = select(one, say)
         return Alone(name, one, selected, conclude(one, selected, its, checks, jobs))
 
@@ -313,6 +329,14 @@ def _compared(
             "searching between impacts", partial(between_impacts, problem), result
         )
         seconds["impacts"] = clock.lap()
+    again: ProblemOf = partial(problem_for, meets=meets)
+    if result.verdict == "gap_unnamed" and is_driven(scene, decided):
+        was, what = problem, "comparing in another way"
+        problem, selection, result = budget.if_time(
+            what, in_another_way, (problem, selection, result)
+        )
+        again = again if problem is was else equations_of
+        seconds["other way"] = clock.lap()
     if isinstance(problem, MechanismProblem):
         what = "comparing recordings one by one"
         result = budget.if_time(what, one_by_one, result)
@@ -366,18 +390,15 @@ def problem_for(
             try:
                 driven = DrivenProblem(scene, recordings)
                 # Equations say less about drives: where windows leave nothing, neither
-                # do they; and they look for loads and forces, too.
+                # do they.
                 if driven.is_explained():
                     return driven, []
-                if sticks(scene, recordings):
+                if driven.looped or sticks(scene, recordings):
                     driven.learn_misfit()
                     return driven, []
             except DoesNotFit:  # It takes Drake's steps.
                 pass
-        recordings, touches = without_contact(dynamics, recordings)
-        scene, finding = _settle_step(scene, recordings, dynamics, jobs)
-        mechanism = MechanismProblem(scene, recordings)
-        return mechanism, [*touches, *finding, *mechanism.push_findings()]
+        return equations_of(scene, recordings, dynamics, jobs)
     if any(joint.num_velocities() for joint in one_dof_joints(dynamics.plant)):
         try:
             return _contact_problem(scene, recordings)
@@ -393,6 +414,29 @@ def problem_for(
     except DoesNotFit:  # More than one free body, or other shapes: by Drake's steps.
         scene, finding = _settle_step(scene, recordings, dynamics, jobs)
         return RolloutProblem(scene, recordings), finding
+
+
+def equations_of(
+    scene: Scene, recordings: Sequence[Recording], dynamics: SceneDynamics, jobs: int
+) -> tuple[MechanismProblem, list[Finding]]:
+    """A mechanism's equations of motion, as problem_for."""
+    recordings, touches = without_contact(dynamics, recordings)
+    scene, finding = _settle_step(scene, recordings, dynamics, jobs)
+    mechanism = MechanismProblem(scene, recordings)
+    return mechanism, [*touches, *finding, *mechanism.push_findings()]
+
+
+def other_problem(
+    problem: GapProblem, scene: Scene, recordings: Sequence[Recording],
+    dynamics: SceneDynamics, jobs: int,
+) -> tuple[GapProblem, list[Finding]]:  # fmt: skip
+    """Of a mechanism that follows commands: its equations where its windows were
+    searched, else its windows. Raises: DoesNotFit."""
+    if isinstance(problem, DrivenProblem):
+        return equations_of(scene, recordings, dynamics, jobs)
+    driven = DrivenProblem(scene, recordings)
+    driven.learn_misfit()
+    return driven, []
 
 
 def _contact_problem(

@@ -8,8 +8,11 @@ from test_gap_statistics import TwoChannels
 
 from makebreak.gap.problem import Candidate, SearchPlan
 from makebreak.gap.search import forward, merge
+from makebreak.gap.search.all_at_once import all_at_once
+from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.search.select import select
 from makebreak.models.effects import KINDS
+from makebreak.models.effects.kind import Effect
 
 
 class Columns(TwoChannels):
@@ -180,54 +183,50 @@ def test_one_effect_that_leaves_as_much_is_better_if_nothing_is_missing_then(
     assert merge._does_better(search, one, two) == better
 
 
-class SharedFriction(Columns):
-    """Joints j1 and j2, with columns of their own; the friction of both is one
-    candidate, and a gain of j2 does nearly what more friction of j2 would do."""
-
-    plan = SearchPlan(least_gain=0.1, most_effects=3, own_values=True)
-
-    def __init__(self):
-        one, two, other = directions(3).T
-        self.joints = {"a.j1": one, "a.j2": two}
-        gain = ("actuator_gain", "a.j2")
-        super().__init__({gain: (two + 0.05 * other)[:, None]}, {})
-        self._base += 1.0 * one + 1.6 * two
-
-    def _column(self, effect):
-        if effect.kind != FRICTION:
-            return self.of[effect.kind, effect.at[0]][:, 0]
-        return sum(c for j, c in self.joints.items() if {j, "a"} & set(effect.at))
-
-    def residual(self, effects=()):
-        r = np.array(self._base)
-        for each in effects:
-            (value,) = each.parameters.values()
-            r -= value * self._column(each)
-        return r
-
-    def column(self, effects, k, name, r):
-        return self._column(effects[k])
-
-    def own_values(self, effects, k, r):
-        shared = effects[k].kind == FRICTION and effects[k].at == ["a"]
-        return self.joints if shared else {}
-
-    def candidates(self, nuisances, current):
-        both = sum(self.joints.values())[:, None]
-        friction = Candidate(
-            FRICTION, ("a",), 1, (both,), (lambda c: {"coulomb": float(c[0])},)
-        )
-        return [friction, *super().candidates(nuisances, current)]
+JOINT = ["arm.joint6"]
 
 
-def test_joints_get_values_of_their_own_before_another_effect_stands_for_them():
-    found = {
-        (c.effect.kind, tuple(c.effect.at)): c.effect.parameters
-        for c in select(SharedFriction()).choices
-    }
-    assert set(found) == {(FRICTION, ("a.j1",)), (FRICTION, ("a.j2",))}
-    assert found[FRICTION, ("a.j1",)]["coulomb"] == pytest.approx(1.0, abs=0.02)
-    assert found[FRICTION, ("a.j2",)]["coulomb"] == pytest.approx(1.6, abs=0.02)
+class OfAJoint(Columns):
+    """A joint with friction, damping and a rotor that the model lacks; a bias does most
+    of what all three do together. `at_once`: kinds from which a search may start."""
+
+    plan = SearchPlan(least_gain=0.1, most_effects=2)
+
+    def __init__(self, hidden, at_once):
+        *three, more = directions(4).T
+        self.at_once = at_once
+        kinds = ("joint_coulomb_friction", "joint_viscous_damping", "rotor_inertia")
+        of = {(k, *JOINT): x[:, None] for k, x in zip(kinds, three, strict=True)}
+        of["actuator_bias", JOINT[0]] = (sum(three) + 0.3 * more)[:, None]
+        super().__init__(of, {(kind, *JOINT): x for kind, x in hidden.items()})
+
+    def rich(self):
+        return [
+            Effect(kind, JOINT, {KINDS[kind].parameters[0].name: 0.1})
+            for kind in self.at_once
+        ]
+
+
+ALL = {"joint_coulomb_friction": 1.0, "joint_viscous_damping": 1.2, "rotor_inertia": 1}
+
+
+def test_effects_that_another_one_stands_for_are_found_when_fitted_at_once():
+    found = named(OfAJoint(ALL, list(ALL)))
+    assert {kind for kind, _ in found} == set(ALL)
+    for (kind, _), choice in found.items():
+        (value,) = choice.effect.parameters.values()
+        assert value == pytest.approx(ALL[kind], abs=0.02)
+    # One after another the bias is added first, and two more are not enough.
+    assert "actuator_bias" in {kind for kind, _ in named(OfAJoint(ALL, []))}
+
+
+def test_of_what_is_fitted_at_once_only_what_is_needed_stays():
+    hidden = dict(list(ALL.items())[:2])
+    search = Comparison(OfAJoint(hidden, list(ALL)), lambda text: None)
+    choices, fitted = all_at_once(search)
+    assert {c.effect.kind for c in choices} == set(hidden)
+    assert fitted.score == pytest.approx(1.0, abs=0.1)
+    assert all_at_once(Comparison(OfAJoint({}, list(ALL)), print))[0] == []
 
 
 class WideLoad(Columns):

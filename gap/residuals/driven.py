@@ -35,7 +35,11 @@ from makebreak.gap.residuals.mechanism import (
     link_changes,
     moved_links,
 )
-from makebreak.gap.residuals.mechanism_candidates import NUISANCE_LIMIT, loads
+from makebreak.gap.residuals.mechanism_candidates import (
+    NUISANCE_LIMIT,
+    loads,
+    tolerances,
+)
 from makebreak.gap.residuals.objects import unexplained_in_windows
 from makebreak.gap.residuals.where import where_in_windows
 from makebreak.gap.result import Where
@@ -45,29 +49,44 @@ from makebreak.gap.simulation.windows import LARGEST, WindowModel
 from makebreak.models.drives import DRIVEN_BY, law_of
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.joints import rotor
-from makebreak.models.effects.kind import Effect, find_joints, full_name
+from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import Scene
 from makebreak.models.scene_schema import COMMANDS_OF
 
-WINDOW_SEC, MOST_WINDOWS = 0.5, 60
 # A joint below this speed is at rest; one that is for this share of the time sticks.
 REST_SPEED, REST_SEC, STICKS = 0.005, 0.2, 0.2
+# A drive's position loop keeps a simulation near: it forgets its start. Without one
+# errors add up.
+WINDOW_SEC, WITHOUT_LOOP_SEC, MOST_WINDOWS = 2.0, 0.5, 60
+# Of what the scene as it came is off by, taken for unknown until a model tells.
+UNKNOWN = 0.1
 # How far a parameter is moved to see what it does, in shares of a typical size.
 SMALL = 0.1
+# Units of the kinds that all joints have in a rich model.
+RICH = ("N m", "N m s/rad", "N m/rad", "kg m2")
+LAW = 0.1  # Of such a step: what is smaller may be the law's own error.
+LIMITS = (0.5, 1.0, 1.5, 2.0)  # Of a joint's rms effort, tried as its most.
+FAR_OFF = 10.0  # Times the noise: what is not asked whether the background explains it.
 JOINTS = ("joint", "actuator", "drive")  # Kinds at these act on a joint.
+BEST_SEC = 0.25  # In which the best start is looked for.
 BESIDE_SEC = 0.06  # About a start, within which a jerk spoils what is known of it.
 
 
 class DrivenWindows(WindowModel):
     """Windows of a mechanism, simulated by compiled code. What an uncertain start does
-    is simulated, too: a stiff drive soon makes it forgotten.
+    is simulated, too: a stiff drive soon makes it forgotten. Rows are 20 ms apart or
+    more: of what a drive follows those between say nothing new.
 
     Raises: DoesNotFit where the scene takes Drake's steps, or no window fits in.
     """
 
+    rows_sec = 0.02
+
     def __init__(self, scene: Scene, recordings: Sequence[Recording]):
+        self.looped = "position_command" in COMMANDS_OF[scene.actuation.type]
+        seconds = WINDOW_SEC if self.looped else WITHOUT_LOOP_SEC
         super().__init__(
-            scene, recordings, WINDOW_SEC, most=MOST_WINDOWS,
+            scene, recordings, seconds, block_sec=max(seconds, 1.2), most=MOST_WINDOWS,
             simulation=DrivenArmSimulation(scene),
         )  # fmt: skip
         base = self.simulate(())
@@ -83,10 +102,10 @@ class DrivenWindows(WindowModel):
         ]
 
     def _best_start(self, time, states, row: int) -> int:
-        """Within half a window, the row about which accelerations jump least: a joint
+        """Of the next BEST_SEC, the row about which accelerations jump least: a joint
         that a command or its friction jerks there has another speed than the smoothed
         one."""
-        last = int(np.searchsorted(time, time[row] + 0.5 * WINDOW_SEC))
+        last = int(np.searchsorted(time, time[row] + BEST_SEC))
         rows = np.arange(row, max(min(last, len(time) - 4), row + 1))
         worst = np.zeros(len(rows))
         for x in states.values():
@@ -100,21 +119,27 @@ class DrivenProblem(DrivenWindows, GapProblem):
 
     by_equations = False
     plan = SearchPlan(  # fmt: skip
-        evaluations=4,
+        evaluations=8,
         diff_step=1e-2,
         most_effects=8,
         by_channel=True,
-        own_values=True,
         shortlist=4,
+        alike=True,
     )
 
     def __init__(self, scene: Scene, recordings: Sequence[Recording]):
         super().__init__(scene, recordings)
-        # What models are off by, of each channel, beside noise.
-        self.misfit = np.zeros(len(self.channels))
+        # What models are off by, of each channel, beside noise: not known yet.
+        off = self.errors_over(
+            self.simulate(()), [np.ones_like(w.std) for w in self.windows]
+        )
+        off = np.nan_to_num(np.concatenate(off), posinf=0.0, neginf=0.0)
+        self.misfit = UNKNOWN * np.sqrt(np.mean(off**2, axis=0))
         self._sizes = self._typical_sizes()
         self._rich: tuple[Effect, ...] = ()
         self._nuisances: Nuisances | None = None
+        self._told: tuple[Fitted, list[Candidate]] | None = None
+        self._slopes: tuple[np.ndarray, list[float], list[str]] | None = None
         self._explained: bool | None = None
 
     # ----- Residuals
@@ -133,7 +158,11 @@ class DrivenProblem(DrivenWindows, GapProblem):
 
     def _misfit_ratio(self) -> np.ndarray:
         """(m,) what rows were divided by over the noise alone."""
-        each = [np.hypot(w.std, self.misfit) / w.std for w in self.windows]
+        return self._divided_by() / self._noise_of_rows()
+
+    def _divided_by(self) -> np.ndarray:
+        """(m,) what rows are divided by."""
+        each = [np.hypot(w.std, self.misfit) for w in self.windows]
         return np.concatenate([x.ravel() for x in each])[self.measured()]
 
     def _noise_of_rows(self) -> np.ndarray:
@@ -144,6 +173,8 @@ class DrivenProblem(DrivenWindows, GapProblem):
     def is_explained(self) -> bool:
         """Whether the scene as it came, its background within its tolerance, explains
         each channel's windows as well as noise lets it."""
+        if self._explained is None and self.noise_error(self.base()) > FAR_OFF:
+            self._explained = False  # No link within its tolerance does that.
         if self._explained is None:
             n = self.nuisances()
             screen = Screen(
@@ -153,7 +184,8 @@ class DrivenProblem(DrivenWindows, GapProblem):
             channel = self.channel_of_rows()
             each = [left[channel == c] for c in np.unique(channel)]
             self._explained = all(rms(x) < MISFIT for x in each)
-            self._nuisances = None  # They are seen beside a rich model, if need be.
+            # They are seen beside a rich model, if need be.
+            self._nuisances = self._slopes = None
         return self._explained
 
     def learn_misfit(self) -> None:
@@ -164,13 +196,15 @@ class DrivenProblem(DrivenWindows, GapProblem):
             return
         # Of kinds with the same unit one is enough.
         start: dict[tuple[str, str], Effect] = {}
-        for kind, at, name, now, step in self._shared():
-            unit = KINDS[kind].parameter(name).unit
-            if step is not None and not KINDS[kind].channel:
-                start.setdefault((unit, at), Effect(kind, [at], {name: now + step}))
+        for kind, name, each in self._at_joints():
+            for joint, (now, step) in each.items():
+                unit = KINDS[kind].parameter(name).unit
+                if step and not KINDS[kind].channel and unit in RICH:
+                    effect = Effect(kind, [joint], {name: now + step})
+                    start.setdefault((unit, joint), effect)
         n = Nuisances.none(len(held))
         screen = Screen(self.base(), n.columns, n.prior, self.train())
-        rich = fit_effects(self, screen, list(start.values()), evaluations=6)
+        rich = fit_effects(self, screen, list(start.values()), evaluations=5)
         left = rich.r
         if rich.fit.train > screen.evaluate(self.base()).train:  # It went astray.
             left = self.base()
@@ -210,26 +244,46 @@ class DrivenProblem(DrivenWindows, GapProblem):
 
     # ----- The search
 
+    def rich(self) -> Sequence[Effect]:
+        return self._rich
+
     def nuisances(self) -> Nuisances:
         """The links' masses and centres of mass, gains of drives and how late their
         loops are, where all is as it may be (a joint that friction holds hardly shows
         them)."""
         if self._nuisances is None:
-            columns, prior, names = [], [], []
-            there = self.residual(self._rich)
-            changes = [
-                *link_changes(self.dynamics, self.scene), *self._late_loops(),
-                *gain_changes(self.scene, self.joints),
-            ]  # fmt: skip
-            for name, effect, size in changes:
-                moved = self.residual([*self._rich, effect])
-                columns.append((there - moved) / size)
-                prior.append(abs(size))
-                names.append(name)
-            self._nuisances = Nuisances(
-                np.stack(columns, axis=1), np.array(prior), tuple(names), NUISANCE_LIMIT
-            ) if columns else Nuisances.none(len(self.train()))  # fmt: skip
+            if self._slopes is None:
+                self._slopes = self._differences()
+            columns, prior, names = self._slopes
+            self._nuisances = Nuisances.none(len(self.train()))
+            if names:
+                columns = columns / self._divided_by()[:, None]
+                self._nuisances = Nuisances(
+                    columns, np.array(prior), tuple(names), NUISANCE_LIMIT
+                )
         return self._nuisances
+
+    def _differences(self) -> tuple[np.ndarray, list[float], list[str]]:
+        """What each nuisance does to simulated samples, (m, n_b) over its size; sizes
+        and names."""
+        columns, prior, names = [], [], []
+
+        def simulated(*effects: Effect) -> np.ndarray:
+            each = self.simulate([*self._rich, *effects])
+            y = np.concatenate([x.ravel() for x in each])[self.measured()]
+            return np.where(np.isfinite(y), y, 0.0)
+
+        there = simulated()
+        changes = [
+            *link_changes(self.dynamics, self.scene), *self._late_loops(),
+            *gain_changes(self.scene, self.joints),
+        ]  # fmt: skip
+        for name, effect, size in changes:
+            columns.append((simulated(effect) - there) / size)
+            prior.append(abs(size))
+            names.append(name)
+        none = np.zeros((len(there), 0))
+        return np.stack(columns, axis=1) if names else none, prior, names
 
     def _late_loops(self):
         """(name, effect, size) as link_changes, of drives' own loops: a velocity that
@@ -255,76 +309,101 @@ class DrivenProblem(DrivenWindows, GapProblem):
         return moved
 
     def candidates(self, nuisances: Nuisances, current: Fitted) -> list[Candidate]:
-        """Kinds at all joints of a model with one value, at each joint, and at bodies
-        and bases. Of a joint alone only what its own channels show of the kind at all
-        joints is looked at: an exact fit follows."""
+        """Kinds at each joint, of which a simulation with all of them tells, and at
+        bodies and bases; a delay also at all joints of a model."""
+        if self._told is None or self._told[0] is not current:
+            self._told = current, self._candidates(current)
+        return self._told[1]
+
+    def _candidates(self, current: Fitted) -> list[Candidate]:
         found: list[Candidate] = []
         taken = {(e.kind, at) for e in current.effects for at in e.at}
-        for kind, at, name, now, step in self._shared():
-            if (kind, at) in taken:
-                continue
-            tries = [now + step] if step is not None else self._limits(at)
+        for kind, name, each in self._at_joints():
+            each = {j: of for j, of in each.items() if (kind, j) not in taken}
             columns, readers = [], []
-            for value in tries:
-                effect = Effect(kind, [at], {name: value})
-                moved = self._residual(current, effect)
-                scale = step if step is not None else 1.0
-                columns.append(((current.r - moved) / scale)[:, None])
-                readers.append(_reader(name, now if step is not None else value,
-                                       1.0 if step is not None else 0.0))  # fmt: skip
-            least = self.dynamics.least(kind, [at])
-            joints = self._joints_of(kind, at)
-            if len(joints) > 1:
+            for times in (1.0,) if all(s for _, s in each.values()) else LIMITS:
+                effects = [
+                    Effect(kind, [j], {name: now + (step or times * self._effort(j))})
+                    for j, (now, step) in each.items()
+                ]
+                columns.append(current.r - self._residual(current, effects))
+            for joint, (now, step) in each.items():
+                mine = self._rows_of(joint)
+                own = [np.where(mine, x, 0.0)[:, None] / (step or 1.0) for x in columns]
+                if step:
+                    readers = [_reader(name, now, 1.0)]
+                else:
+                    readers = [
+                        _reader(name, x * self._effort(joint), 0.0) for x in LIMITS
+                    ]
                 found.append(
-                    Candidate(kind, (at,), 1, tuple(columns), tuple(readers),
-                              least=least)
+                    Candidate(kind, (joint,), 1, tuple(own), tuple(readers),
+                              least=self.dynamics.least(kind, [joint]))
                 )  # fmt: skip
-            for joint in joints:
-                if (kind, joint) in taken:
-                    continue
-                mine = self._rows_of(joint)[:, None]
-                own = tuple(np.where(mine, x, 0.0) for x in columns)
-                if any(x.any() for x in own):
-                    found.append(
-                        Candidate(kind, (joint,), 1, own, tuple(readers),
-                                  least=self.dynamics.least(kind, [joint]))
-                    )  # fmt: skip
+            if KINDS[kind].path == "delay" and each:
+                _, step = next(iter(each.values()))
+                for model in dict.fromkeys(j.split(".")[0] for j in each):
+                    if (kind, model) not in taken:
+                        whole = ((columns[0] / step)[:, None],)
+                        reader = (_reader(name, 0.0, 1.0),)
+                        found.append(Candidate(kind, (model,), 1, whole, reader))
         found += loads(
-            self.dynamics, taken, current.r, partial(self._residual, current),
+            self.dynamics, taken, current.r, partial(self._with_load, current.r),
             lambda kind: self.dynamics.places(kind) if can_have(kind) else (),
         )  # fmt: skip
         return [c for c in found if any(x.any() for x in c.columns)]
 
-    def _residual(self, current: Fitted, effect: Effect) -> np.ndarray:
+    def _with_load(self, r: np.ndarray, effect: Effect) -> np.ndarray | None:
+        """(m,) what a small load leaves of r (m,), by what the mass of its link and
+        where its centre is do; None where that is no nuisance."""
+        assert self._slopes is not None
+        columns, _, names = self._slopes
+        (at,), p = effect.at, effect.parameters
+        rows = {name: k for k, name in enumerate(names) if f" of {at}, " in name}
+        kinds = {kind: self.dynamics.now(kind, [at]) for kind in tolerances(self.scene)}
+        each = [
+            (rows.get(f"{kind} of {at}, {name}"), value)
+            for kind, now in kinds.items()
+            for name, value in now.items()
+        ]
+        some = [k for k, _ in each if k is not None]
+        if len(each) != 4 or len(some) != 4:
+            return None
+        (_, mass), *centre = each
+        more = p.get("mass", 0.0)
+        moves = [more, *(p.get(axis, 0.0) for axis in "xyz")]
+        if "com_x" in p:
+            place = [p[f"com_{axis}"] for axis in "xyz"]
+            moves[1:] = [
+                more * (x - c) / (mass + more)
+                for x, (_, c) in zip(place, centre, strict=True)
+            ]
+        return r + columns[:, some] @ np.array(moves) / self._divided_by()
+
+    def _residual(self, current: Fitted, more: Sequence[Effect]) -> np.ndarray:
         try:
-            return self.residual([*current.effects, effect])
+            return self.residual([*current.effects, *more])
         except ValueError:  # Not with these.
             return current.r
 
-    def own_values(
-        self, effects: Sequence[Effect], k: int, r: np.ndarray
-    ) -> dict[str, np.ndarray]:
-        """{joint: (m,) column} of a value of its own for each joint that effect k has,
-        beside the shared one."""
-        effect, plant = effects[k], self.dynamics.plant
-        if KINDS[effect.kind].at not in JOINTS:
-            return {}
-        joints = [full_name(plant, j) for j in find_joints(effect, plant)]
-        joints = [j for j in joints if self._takes(effect.kind, j)]
-        names = [p.name for p in KINDS[effect.kind].parameters]
-        if len(joints) < 2 or len(names) != 1:
-            return {}
-        column = self.column(effects, k, names[0], r)
-        return {j: np.where(self._rows_of(j), column, 0.0) for j in joints}
+    def apart(self, effects: Sequence[Effect], names) -> list[list[int]]:
+        """What one joint is given moves others only as fast as no drive can follow."""
+        found: list[list[int]] = []
+        nth: dict[str, int] = {}
+        sets: dict[int, list[int]] = {}
+        for k, (i, _) in enumerate(names):
+            at = effects[i].at
+            if KINDS[effects[i].kind].at not in JOINTS or "." not in at[0]:
+                found.append([k])
+                continue
+            nth[at[0]] = nth.get(at[0], -1) + 1
+            sets.setdefault(nth[at[0]], []).append(k)
+        return [*sets.values(), *found]
 
-    def column(self, effects, k: int, name: str, r: np.ndarray) -> np.ndarray:
-        """(m,) what more of a parameter takes off the residual r (m,)."""
-        value = effects[k].parameters[name]
-        step = 0.05 * abs(value) or 1e-3
-        more = Effect(effects[k].kind, effects[k].at, {**effects[k].parameters,
-                                                       name: value + step})  # fmt: skip
-        moved = self.residual([*effects[:k], more, *effects[k + 1 :]])
-        return (r - moved) / step
+    def moved_by(self, effect: Effect) -> np.ndarray:
+        if KINDS[effect.kind].at not in JOINTS or "." not in effect.at[0]:
+            return np.ones(len(self.train()), bool)
+        return np.any([self._rows_of(joint) for joint in effect.at], axis=0)
 
     def _rows_of(self, joint: str) -> np.ndarray:
         mine = [c.rsplit(".", 1)[0] == joint for c in self.channels]
@@ -333,33 +412,26 @@ class DrivenProblem(DrivenWindows, GapProblem):
     def _takes(self, kind: str, joint: str) -> bool:
         return joint in self.dynamics.places(kind)
 
-    def _joints_of(self, kind: str, model: str) -> list[str]:
-        return [p for p in self.dynamics.places(kind) if p.split(".")[0] == model]
-
-    def _shared(self):
-        """(kind, model, parameter, its value now, a step; None where values are tried)
-        of all kinds with one parameter at joints."""
-        models = list(dict.fromkeys(j.split(".")[0] for j in self.joints))
+    def _at_joints(self):
+        """(kind, parameter, {joint: (its value now, a step)}) of all kinds with one
+        parameter at joints; no step where values are tried."""
         for kind, entry in KINDS.items():
             if entry.at not in JOINTS or not can_have(kind):
                 continue
             if len(entry.parameters) != 1:
                 continue
             (parameter,) = entry.parameters
-            for model in models:
-                joints = self._joints_of(kind, model)
-                if not joints:
-                    continue
-                each = [self.dynamics.now(kind, [j])[parameter.name] for j in joints]
-                now = float(np.median(each))
-                step = None
-                if now < 1e20:
-                    step = self._step(parameter.unit, now, joints)
-                yield kind, model, parameter.name, now, step
+            each = {}
+            for joint in self.dynamics.places(kind):
+                now = self.dynamics.now(kind, [joint]).get(parameter.name, np.inf)
+                step = self._step(parameter.unit, now, joint) if now < 1e20 else 0.0
+                each[joint] = (now if step else 0.0), step
+            if each:
+                yield kind, parameter.name, each
 
-    def _step(self, unit: str, now: float, joints: Sequence[str]) -> float:
-        rows = [self.joints.index(j) for j in joints]
-        effort, speed, inertia = (float(np.median(x[rows])) for x in self._sizes)
+    def _step(self, unit: str, now: float, joint: str) -> float:
+        k = self.joints.index(joint)
+        effort, speed, inertia = (float(x[k]) for x in self._sizes)
         typical = {
             "N m": SMALL * effort,
             "N m s/rad": SMALL * effort / speed,
@@ -371,9 +443,8 @@ class DrivenProblem(DrivenWindows, GapProblem):
         }
         return typical.get(unit, 0.15)
 
-    def _limits(self, model: str) -> list[float]:
-        effort = self._sizes[0]
-        return [float(x * effort.max()) for x in (0.5, 1.0, 1.5, 2.0)]
+    def _effort(self, joint: str) -> float:
+        return float(self._sizes[0][self.joints.index(joint)])
 
     def _typical_sizes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Of each joint: rms of what its drive gives by its law [N m], rms speed
@@ -412,6 +483,23 @@ class DrivenProblem(DrivenWindows, GapProblem):
 
     def judged(self) -> dict[str, str]:
         return dict.fromkeys(self.channels, "simulation")
+
+    def is_within_law(self, effect: Effect) -> bool:
+        return self.is_within_tolerance(effect)
+
+    def is_within_tolerance(self, effect: Effect) -> bool:
+        """Drives keep time, and friction reverses, as well as laws say it: to 1 % of a
+        gain, of a joint's inertia and of its effort."""
+        kind, at = effect.kind, effect.at[0]
+        if KINDS[kind].at not in JOINTS or len(effect.parameters) != 1:
+            return False
+        joint = at if "." in at else self.joints[0]
+        ((name, value),) = effect.parameters.items()
+        now = self.dynamics.now(kind, [joint]).get(name, np.inf)
+        if not now < 1e20:
+            return False
+        size = abs(self._step(KINDS[kind].parameter(name).unit, now, joint))
+        return abs(value - now) < LAW * size
 
     def parts(self) -> np.ndarray:
         return self._by_row([w.recording for w in self.windows])

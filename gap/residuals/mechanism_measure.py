@@ -6,11 +6,13 @@ from functools import partial
 
 import numpy as np
 
+from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.parallel import side_by_side
 from makebreak.gap.problem import rms
 from makebreak.gap.residuals.inverse import InverseModel
 from makebreak.gap.residuals.where import where_in_windows
 from makebreak.gap.result import GapMeasure, InUnits, Series, Where
+from makebreak.gap.simulation.driven_arm import DrivenArmSimulation, can_have
 from makebreak.gap.simulation.measure import (
     WINDOW_SEC,
     gap_measure,
@@ -18,6 +20,7 @@ from makebreak.gap.simulation.measure import (
     why_stopped,
 )
 from makebreak.gap.simulation.windows import Window, WindowModel, seen_in
+from makebreak.models.drives import law_of
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, sliding_joints
 from makebreak.models.effects.transmission import twist_deviations, twists
@@ -44,8 +47,9 @@ def measure(
         count in neither. slow_noise: as WindowModel.
     """
     model = WindowModel(
-        scene, motion.recordings, WINDOW_SEC, most=240, slow_noise=slow_noise
-    )
+        scene, motion.recordings, WINDOW_SEC, most=240, slow_noise=slow_noise,
+        simulation=_compiled(scene, [*moved, *effects]),
+    )  # fmt: skip
     taken = {(e.kind, tuple(e.at)) for e in effects}
     moved = [e for e in moved if (e.kind, tuple(e.at)) not in taken]
     trials = [moved, [*moved, *effects]] if effects else [moved]
@@ -83,6 +87,18 @@ def measure(
         ))  # fmt: skip
         gap = replace(gap, before=start, after=end, seconds=seconds)
     return gap, [], []
+
+
+def _compiled(scene: Scene, effects: Sequence[Effect]) -> DrivenArmSimulation | None:
+    """Compiled code that steps joints whose drives close a loop; None: it takes Drake's
+    steps."""
+    if law_of(scene.actuation, next(iter(scene.actuation.joints), "")) is None:
+        return None  # What a drive does not hold shows the error of every step.
+    try:
+        simulation = DrivenArmSimulation(scene)
+    except DoesNotFit:
+        return None
+    return simulation if all(can_have(e.kind) for e in effects) else None
 
 
 def _simulated(model: WindowModel, effects: Sequence[Effect], held, lag):

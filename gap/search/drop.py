@@ -28,6 +28,7 @@ from makebreak.gap.thresholds import (
 )
 from makebreak.models.effects import KINDS
 
+BEYOND_DOUBT = 30.0  # Deviations.
 _EVALUATIONS = 5  # Gauss-Newton steps of a fit with one effect less.
 
 
@@ -45,6 +46,8 @@ def drop_needless(
         left = screen.fit_nuisances(current.r)[1]
         needless: list[tuple[float, int, Fitted]] = []
         for k in range(len(chosen)):
+            if search.plan.alike and _is_beyond_doubt(search, chosen, current, k):
+                continue
             rest = search.without(current.effects, k)
             fixed = [c.fixed for i, c in enumerate(chosen) if i != k]
             try:
@@ -69,6 +72,17 @@ def drop_needless(
             chosen = refreshed(chosen, current)
             current = search.refit(chosen, current)
     return chosen, current
+
+
+def _is_beyond_doubt(
+    search: Comparison, chosen: Sequence[Choice], current: Fitted, k: int
+) -> bool:
+    """Whether an effect is so many deviations off neutral that no fit without it need
+    be tried."""
+    effect = current.effects[k]
+    now = search.problem.dynamics.now(effect.kind, effect.at[:1])
+    sure = replace(chosen[k], effect=effect, std=current.std[k])
+    return BEYOND_DOUBT < deviations_off(sure, now) < np.inf
 
 
 def _stays(

@@ -11,6 +11,7 @@ from makebreak.gap.fit import derivative_free_search, fit_effects
 from makebreak.gap.problem import Fitted
 from makebreak.gap.result import Considered
 from makebreak.gap.search.add import add_next
+from makebreak.gap.search.all_at_once import all_at_once
 from makebreak.gap.search.choice import (
     Choice,
     fixed_parameters,
@@ -19,7 +20,6 @@ from makebreak.gap.search.choice import (
 )
 from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.search.merge import merge
-from makebreak.gap.search.own_values import with_own_values
 from makebreak.gap.search.refine import refine
 from makebreak.gap.search.rivals import Rivals, in_place_of
 from makebreak.gap.thresholds import (
@@ -64,6 +64,10 @@ def forward(search: Comparison) -> Path:
     two apart that did equally well when the choice was made."""
     path, rivals = Path((State((), search.start),)), Rivals(search)
     try:
+        path = _step(search, rivals, path)
+        chosen, fitted = all_at_once(search)
+        if search.error(fitted.score) < search.enough(path.end.fitted.score):
+            path = Path((path.states[0], State(tuple(chosen), fitted)), path.table)
         while not path.ended:
             path = _step(search, rivals, path)
     except Stopped:
@@ -106,23 +110,11 @@ def _step(search: Comparison, rivals: Rivals, path: Path) -> Path:
             search.start_again()
             current = search.refit(chosen, current)
             chosen = refreshed(chosen, current)
-    better = [merge, refine]
-    if search.plan.own_values:
-        # Else another effect would stand for what joints do not share.
-        better.append(_with_own_values_if_needed)
-    for of in better:
+    for of in (merge, refine):
         chosen, current = search.if_time(
             "improving the last effects", partial(of, search), chosen, current
         )
     return path.plus(State(tuple(chosen), current), step.table)
-
-
-def _with_own_values_if_needed(
-    search: Comparison, chosen: Sequence[Choice], current: Fitted
-) -> tuple[list[Choice], Fitted]:
-    if not search.needs_more(current):
-        return list(chosen), current
-    return with_own_values(search, chosen, current)
 
 
 def _converged(search: Comparison, chosen: Sequence[Choice], current: Fitted) -> Fitted:

@@ -14,7 +14,6 @@ The stages, each in a file of its own:
     merge.py        one effect in the place of two
     sets.py         ties of two effects together
     refine.py       a further parameter of an effect that is named
-    own_values.py   one value for each joint
     drop.py         what is not needed, or not certain
 
 comparison.py says what "better" means in all of them, gap/thresholds.py by how much.
@@ -37,7 +36,6 @@ from makebreak.gap.search.choice import (
 from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.search.drop import drop_needless, keep_certain, simplify
 from makebreak.gap.search.forward import forward
-from makebreak.gap.search.own_values import with_own_values
 from makebreak.gap.search.rivals import (
     still_tied,
     with_rivals_of_pairs,
@@ -74,8 +72,6 @@ def _pruned(
         "dropping what is not needed": [drop_needless, simplify],
         "whether each effect is certain": [keep_certain],
     }
-    if search.plan.own_values:
-        steps = {"a value for each joint": [with_own_values], **steps}
     for what, each in steps.items():
         for step in each if chosen else ():
             chosen, current = search.if_time(

@@ -184,7 +184,7 @@ def pick_simplest(
         and r.candidate.size <= best.candidate.size
         and f.score <= most
     ]  # fmt: skip
-    if best.candidate.members and alone:
+    if best.candidate.members and alone and not search.plan.alike:
         pick = min(alone, key=lambda k: errors[k])
         fit, best = trials[pick]
     pick = _clearly_better(search, trials, pick)

@@ -97,7 +97,7 @@ class WindowedResidual:
         """A window's value for each of its rows, (m,)."""
         k = len(self.channels)
         each = [
-            np.full((w.rows.stop - w.rows.start) * k, x)
+            np.full(n_rows(w) * k, x)
             for w, x in zip(self.windows, of_window, strict=True)
         ]
         return np.concatenate(each)[self.measured()]
@@ -117,8 +117,13 @@ class WindowedResidual:
     def channel_of_rows(self) -> np.ndarray:
         """(m,) index of the channel of each row."""
         k = len(self.channels)
-        n = sum(w.rows.stop - w.rows.start for w in self.windows)
+        n = sum(map(n_rows, self.windows))
         return np.tile(np.arange(k), n)[self.measured()]
+
+
+def n_rows(window) -> int:
+    rows = window.rows
+    return len(range(rows.start, rows.stop, rows.step or 1))
 
 
 def seen_in(model, window) -> np.ndarray:
@@ -138,6 +143,7 @@ class WindowModel(WindowedResidual):
     """
 
     commands_late = 0.0
+    rows_sec = 0.0  # Rows closer than this are left out.
 
     def __init__(
         self,
@@ -282,6 +288,7 @@ class WindowModel(WindowedResidual):
         # At an end a smoothed state is less sure than it knows, and what was commanded
         # before is not known.
         margin = min(MARGIN_SEC, 0.1 * (time[-1] - time[0]))
+        every = max(int(self.rows_sec / float(np.median(np.diff(time))) + 1e-6), 1)
         start_row = int(np.searchsorted(time, time[0] + margin))
         while start_row < len(time) - 3:
             start_row = self._best_start(time, states, start_row)
@@ -293,12 +300,11 @@ class WindowModel(WindowedResidual):
                 np.isfinite(u[start_row]) for u in commands
             )
             if ok:
-                after = time[start_row:last] - t0
-                std = np.empty((last - start_row, len(self.channels)))
+                rows = slice(start_row, last, every)
+                after = time[rows] - t0
+                std = np.empty((len(after), len(self.channels)))
                 state = {n: x[start_row] for n, x in states.items()}
-                grown = self._grown(
-                    recording, states, spreads, slice(start_row, last), after, jumps
-                )
+                grown = self._grown(recording, states, spreads, rows, after, jumps)
                 # No less than along a straight line: behind filters a smoothed state is
                 # less sure than it knows, also where the motion makes little of it.
                 for c, name in enumerate(self.channels):
@@ -312,7 +318,7 @@ class WindowModel(WindowedResidual):
                 self.windows.append(
                     Window(
                         i, episode.number, float(t0),
-                        slice(episode.first + start_row, episode.first + last),
+                        slice(episode.first + start_row, episode.first + last, every),
                         state, std,
                         block_number % 3 != 1,
                         {n: P[start_row, :2, :2] for n, P in spreads.items()},
