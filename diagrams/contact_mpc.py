@@ -12,6 +12,7 @@ from makebreak.systems.contact_mpc.lcs_builder import (
     ContactPair,
     LcsBuilderConfig,
 )
+from makebreak.systems.contact_mpc.multibody.model_parameters import Parameter
 from makebreak.systems.contact_mpc.numerics.c3_mpc import C3Bounds, C3Options, C3Weights
 
 
@@ -32,13 +33,16 @@ class ContactMpcConfig:
     # Each knot has its own LCS, taken along the last plan; else all have the LCS about
     # the present state.
     lcs_along_plan: bool = False
+    # Those that a ParameterLearner learns; the plan is for its values of them.
+    parameters: list[Parameter] = field(default_factory=list)
 
 
 def make_contact_mpc(model: Diagram, config: ContactMpcConfig) -> Diagram:
     """C3+ on the LCS about the present state.
 
     Inputs:  x (n_x,), the state [q, v] of the model's plant; r_comp (n_lam,),
-             optional, of a ResidualLearner whose period is dt_sec.
+             optional, of a ResidualLearner whose period is dt_sec; parameters (n,),
+             with config.parameters only, of a ParameterLearner.
     Outputs: u (n_u,) [N, N m]; status (1,), a C3Status; plan, a Plan (abstract); lcs,
              what the plan is for (abstract; a tuple with lcs_along_plan), about the x
              of each multiple of period_sec.
@@ -61,6 +65,7 @@ def make_contact_mpc(model: Diagram, config: ContactMpcConfig) -> Diagram:
                 period_sec=c.period_sec,
                 closest=c.closest,
                 knots=c.options.N if c.lcs_along_plan else 0,
+                parameters=c.parameters,
             ),
         ),
     )
@@ -107,6 +112,8 @@ def make_contact_mpc(model: Diagram, config: ContactMpcConfig) -> Diagram:
     builder.ExportInput(lcs.GetInputPort("x"), "x")
     builder.ConnectInput("x", c3.GetInputPort("x"))
     builder.ExportInput(c3.GetInputPort("r_comp"), "r_comp")
+    if c.parameters:
+        builder.ExportInput(lcs.GetInputPort("parameters"), "parameters")
     for name in ("u", "status", "plan"):
         builder.ExportOutput(c3.GetOutputPort(name), name)
     builder.ExportOutput(lcs.GetOutputPort("lcs"), "lcs")

@@ -17,6 +17,7 @@ from makebreak.systems.contact_mpc.multibody.contact_pair import (
     ContactPair,
     StewartTrinkle,
 )
+from makebreak.systems.contact_mpc.multibody.model_parameters import Parameter
 from makebreak.systems.contact_mpc.numerics.c3_plan import Plan
 from makebreak.systems.numerics.settings import check_settings
 from makebreak.systems.numerics.timing import timed
@@ -42,6 +43,8 @@ class LcsBuilderConfig:
     closest: int | None = None  # Number of contacts, the nearest ones; None: all.
     # 0: one LCS about x. N: a tuple of N, one for each knot along the input `plan`.
     knots: int = 0
+    # Of bodies, joints and pairs, whose values the input `parameters` has.
+    parameters: list[Parameter] = field(default_factory=list)
 
 
 class LcsBuilderStatus(IntEnum):
@@ -58,7 +61,8 @@ class AnitescuLcsBuilder(LeafSystem):
 
     Inputs:  x (n_x,) state [q, v] of the model plant; u (n_u,) its actuation;
              friction (n_pairs,) of the pairs, optional; gap (n_pairs,) added to their
-             distances [m], optional;
+             distances [m], optional; parameters (n,), with config.parameters only,
+             optional: their values, as of a ParameterLearner;
              plan (abstract, Plan), with config.knots > 0 only: the last plan, about
              whose states the LCS of all knots but the first are built. Before the
              first plan, all are about x.
@@ -80,7 +84,12 @@ class AnitescuLcsBuilder(LeafSystem):
                 "0"
             )
         self.model = AnitescuLcs(
-            diagram, c.contacts, c.dt_sec, c.eps_c, closest=c.closest
+            diagram,
+            c.contacts,
+            c.dt_sec,
+            c.eps_c,
+            closest=c.closest,
+            parameters=c.parameters,
         )
         initial = self.model.at_default()
         self._knots = int(c.knots)
@@ -90,6 +99,9 @@ class AnitescuLcsBuilder(LeafSystem):
             self.DeclareVectorInputPort(name, self.model.n_pairs)
             for name in ("friction", "gap")
         ]
+        if c.parameters:
+            n = len(c.parameters)
+            self._changes.append(self.DeclareVectorInputPort("parameters", n))
         if self._knots:
             self._plan = self.DeclareAbstractInputPort(
                 "plan", AbstractValue.Make(object())
@@ -120,7 +132,7 @@ class AnitescuLcsBuilder(LeafSystem):
         state.get_mutable_discrete_state(self._status).set_value([float(status)])
 
     def _changed(self, context):
-        """The arguments friction and gap of AnitescuLcs.build."""
+        """The arguments friction, gap and parameters of AnitescuLcs.build."""
         return (
             port.Eval(context) if port.HasValue(context) else None
             for port in self._changes

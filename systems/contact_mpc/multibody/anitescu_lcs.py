@@ -19,6 +19,7 @@ from pydrake.systems.framework import Diagram
 
 from makebreak.systems.contact_mpc.multibody.constant_mass import constant_mass_model
 from makebreak.systems.contact_mpc.multibody.contact_layout import ContactLayout
+from makebreak.systems.contact_mpc.multibody.model_parameters import ModelParameters
 from makebreak.systems.contact_mpc.multibody.smooth_dynamics import SmoothDynamics
 from makebreak.systems.contact_mpc.multibody.witness_points import WitnessPoints
 from makebreak.systems.contact_mpc.numerics.constant_mass import (
@@ -45,20 +46,30 @@ class AnitescuLcs:
             geometries at each state; None: all. The pairs must then have the same kind
             of contact.
         analytic: whether the fast path is used where the model allows it.
+        parameters: those that `build` may be given values of (Parameter).
 
     Attributes:
         n_q, n_v, n_x, n_u, n_lam, n_pairs: sizes; x = [q, v] in the plant's order.
         x_default: (n_x,) the plant's default state.
         x_names, lam_names: of each state, and of each entry of lam, "geometry~geometry
             edge" (where the nearest are taken: "nearest k of geometry~... edge").
-        is_analytic: which of the two paths `build` takes.
+        is_analytic: which of the two paths `build` takes; with parameters of bodies or
+            joints the general one.
+        parameters: their names and nominal values (ModelParameters).
 
     Raises: ValueError naming a pair that does not exist, a body without collision
         geometry, shapes without a distance, or a parameter out of range.
     """
 
     def __init__(
-        self, diagram, pairs, dt_sec=0.1, eps_c=None, analytic=True, closest=None
+        self,
+        diagram,
+        pairs,
+        dt_sec=0.1,
+        eps_c=None,
+        analytic=True,
+        closest=None,
+        parameters=(),
     ):
         self._plant, scene_graph = _plant_and_scene_graph(diagram)
         plant, inspector = self._plant, scene_graph.model_inspector()
@@ -84,8 +95,12 @@ class AnitescuLcs:
         self.lam_names = self._contacts.lam_names
         self._points = WitnessPoints(plant, inspector, self._contacts)
         self._points.check(self._plant_context)
+        self.parameters = ModelParameters(
+            parameters, plant, self._plant_context, self._contacts.mu_of_pairs
+        )
+        self._values = self.parameters.nominal
         self._model = None
-        if analytic:
+        if analytic and not self.parameters.is_dynamic.any():
             self._model = constant_mass_model(
                 plant, self._plant_context, inspector, self._dynamics, self._contacts,
                 self._points.frames,
@@ -97,14 +112,16 @@ class AnitescuLcs:
         """The LCS about the plant's default state, without input."""
         return self.build(self.x_default, np.zeros(self.n_u))
 
-    def build(self, x, u, friction=None, gap=None) -> LCS:
+    def build(self, x, u, friction=None, gap=None, parameters=None) -> LCS:
         """The LCS about the state x = [q, v] (n_x,) and the input u (n_u,).
 
         Quaternions in x are normalised first; the LCS's d and c refer to the
         normalised state.
 
         Args: friction (n_pairs,): coefficient of each pair; None: as configured;
-            gap (n_pairs,) [m]: added to the distances of each pair; None: zero.
+            gap (n_pairs,) [m]: added to the distances of each pair; None: zero;
+            parameters (n,): values of all parameters, in their order and units; None:
+            the nominal ones.
         Raises: ValueError on a wrong size, an entry that is not finite, a quaternion
             whose norm is not between 0.5 and 2, geometry without a unique normal,
             friction below 0, or friction for a Stewart-Trinkle pair that has none.
@@ -126,12 +143,66 @@ class AnitescuLcs:
                 )
             x[start : start + 4] /= norm
         contacts = self._contacts
+        if len(self.parameters):
+            friction, gap = self._use(parameters, friction, gap)
+        elif parameters is not None and np.size(parameters):
+            raise ValueError(
+                f"{np.size(parameters)} parameters came, expected none: AnitescuLcs "
+                "was made without"
+            )
         mu = contacts.mu if friction is None else contacts.friction_of(friction)
         if self._model is None:
             lcs = self._build_general(x, u, mu)
         else:
             lcs = self._build_analytic(self._model, x, u, mu)
         return lcs if gap is None else contacts.with_gap(lcs, gap)
+
+    def _use(self, values, friction, gap):
+        """Sets the parameters' values; returns the pairs' friction and gaps."""
+        p = self.parameters
+        values = p.nominal if values is None else np.array(values, dtype=float)
+        if values.shape != p.nominal.shape or not is_finite(values):
+            raise ValueError(
+                f"parameters is {values}, expected ({len(p)},), finite: {p.names}"
+            )
+        if not np.array_equal(values[p.is_dynamic], self._values[p.is_dynamic]):
+            self._dynamics.set_parameters(p, values)
+        self._values = values
+        if friction is None:
+            friction = self._contacts.mu_of_pairs
+        gap = np.zeros(self.n_pairs) if gap is None else gap
+        friction = p.of_pairs("friction", values, friction)
+        return friction, p.of_pairs("gap", values, gap)
+
+    def between(self, x, x_next) -> tuple[np.ndarray, np.ndarray]:
+        """The constant velocity (n_v,) that leads from x to x_next, both (n_x,), in one
+        time step, and the mass matrix (n_v, n_v) half-way."""
+        q, q_next = x[: self.n_q], x_next[: self.n_q]
+        middle = 0.5 * (q + q_next)
+        self._plant.SetPositions(self._plant_context, middle)
+        _, N_plus = self._dynamics.velocity_maps(middle)
+        M = self._plant.CalcMassMatrix(self._plant_context)
+        return N_plus @ (q_next - q) / self.dt_sec, M
+
+    def step_changes(self, x, u, lcs: LCS, lam, parameters):
+        """How a step changes with the parameters of bodies and joints, at the forces
+        lam (n_lam,) [N].
+
+        Args: x, u, parameters: what `lcs` was built with.
+        Returns: of x_next (n_x, n) and of the gap velocities w (n_lam, n), zero for
+            parameters of pairs. M f = tau - r and M dv = dt J' lam have the same
+            derivative as the torque of the whole step's acceleration.
+        """
+        p, dt, n_q = self.parameters, self.dt_sec, self.n_q
+        x_next = lcs.A @ x + lcs.B @ u + lcs.D @ lam + lcs.d
+        dx = np.zeros((self.n_x, len(p)))
+        plant, context = self._plant, self._plant_context
+        plant.SetPositionsAndVelocities(context, x)
+        torque = p.torque_changes(context, parameters, (x_next - x)[n_q:] / dt)
+        dv = -dt * np.linalg.solve(plant.CalcMassMatrix(context), torque)
+        N, _ = self._dynamics.velocity_maps(x[:n_q])
+        dx[n_q:], dx[:n_q] = dv, dt * (N @ dv)
+        return dx, lcs.J @ dv
 
     def _build_analytic(self, model: ConstantMassModel, x, u, mu) -> LCS:
         contacts, chosen = self._contacts, None

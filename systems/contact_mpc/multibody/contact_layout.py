@@ -28,7 +28,7 @@ class ContactLayout:
         geometries, names, mu, reference, planar: as of Contact.
         every: (n,) 0, 1, ..., n - 1.
     Others:
-        n_pairs, n_lam: sizes. chooses: whether the LCS has only the nearest contacts.
+        n_pairs, n_lam: sizes; mu_of_pairs (n_pairs,). chooses: whether the LCS has only the nearest contacts.
         groups_in_arrays: for compiled callers (nearest_of_groups); None where friction
             may differ within a group.
         rows: ContactRows; lam_names: of each row.
@@ -47,6 +47,9 @@ class ContactLayout:
         self.geometries = [contact.geometries for contact in contacts]
         self.names = [contact.name for contact in contacts]
         self.mu = np.array([contact.mu for contact in contacts])
+        self.mu_of_pairs = np.zeros(len(pairs))  # As configured.
+        for contact in contacts:
+            self.mu_of_pairs[contact.pair] = contact.mu
         self.reference = np.array([contact.reference for contact in contacts])
         self.planar = np.array([contact.planar for contact in contacts])
         self.every = np.arange(len(contacts))

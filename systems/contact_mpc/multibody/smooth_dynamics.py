@@ -8,6 +8,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import MultibodyForces, MultibodyForces_
 from pydrake.systems.framework import Context
 
+from makebreak.systems.contact_mpc.multibody.model_parameters import ModelParameters
 from makebreak.systems.contact_mpc.numerics.rigid_body import velocity_maps
 
 
@@ -33,6 +34,11 @@ class SmoothDynamics:
         self._context_ad = self._plant_ad.CreateDefaultContext()
         self._forces_ad = MultibodyForces_[AutoDiffXd](self._plant_ad)
         self.plain, self.floating, self._maps_known = _velocity_layout(plant)
+
+    def set_parameters(self, parameters: ModelParameters, values) -> None:
+        """Sets the values (n,) of the dynamic parameters for all that follows."""
+        parameters.put(self._plant, self._context, values)
+        parameters.put(self._plant_ad, self._context_ad, values, AutoDiffXd)
 
     def linearise(self, x: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, ...]:
         """f (n_v,) at x = [q, v] (n_x,) and u (n_u,), its derivatives J_q (n_v, n_q),

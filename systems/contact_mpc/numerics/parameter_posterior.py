@@ -1,0 +1,308 @@
+"""A Gaussian belief of physical parameters, from one measured step after another.
+
+The violation-based loss l_k of a measured step (residual_learner.py), with weights that
+are inverse variances, is a negative log-likelihood of the parameters: the contact
+forces are latent, chosen for the parameters by the loss itself. The belief N(m, L^-1)
+of the scaled parameters z (zero: the model's value; one: its standard deviation) goes
+to the minimum of
+
+    1/2 (z - m)' L (z - m) + trust l_k(z)
+
+by damped Gauss-Newton steps: an iterated extended Kalman filter in information form,
+so that what no step tells stays at the model's value, with the model's deviation.
+
+With rows a(z, lam) of the prediction and of the closed contacts, the forces that are
+free are eliminated: only the part of da/dz that no change of these forces explains
+tells of z (variable projection, Golub and Pereyra, SIAM J. Numerical Analysis 10
+(1973); Kaufman, BIT 15 (1975)).
+
+Source: the loss, ACI-MPC section VI; the filter: Bell, Cathey, IEEE Trans. Automatic
+Control 38 (1993).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from makebreak.systems.contact_mpc.numerics.lcs import LCS, opening_speed
+from makebreak.systems.contact_mpc.numerics.residual_learner import (
+    solve_step,
+)
+
+NEWTON_STEPS = 4  # Of one update, at most.
+HALVINGS = 4  # Of a Gauss-Newton step that does not lower the cost.
+SMALL = 1e-2  # A change of z that ends the update.
+
+
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """Of the scaled parameters z: mean (n,) and information (n, n)."""
+
+    mean: np.ndarray
+    information: np.ndarray
+
+    def __post_init__(self):
+        self.mean.setflags(write=False)
+        self.information.setflags(write=False)
+
+    def __deepcopy__(self, memo):
+        return self  # Nothing in it can change.
+
+    @property
+    def std(self) -> np.ndarray:
+        """(n,) standard deviations."""
+        return np.sqrt(np.diag(np.linalg.inv(self.information)))
+
+
+def prior(n: int) -> Belief:
+    """What the model says: zero, with a deviation of one."""
+    return Belief(np.zeros(n), np.eye(n))
+
+
+@dataclass(frozen=True, eq=False)
+class Scale:
+    """z of physical values: nominal exp(std z) where positive, else nominal + std z."""
+
+    nominal: np.ndarray  # (n,)
+    std: np.ndarray  # (n,)
+    positive: np.ndarray  # (n,) bool
+
+    def values(self, z) -> np.ndarray:
+        grown = self.nominal * np.exp(np.where(self.positive, self.std * z, 0.0))
+        return np.where(self.positive, grown, self.nominal + self.std * z)
+
+    def slopes(self, values) -> np.ndarray:
+        """(n,) derivative of the values in z."""
+        return np.where(self.positive, values, 1.0) * self.std
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """One measured step: from x_now (n_x,) under the mean input u (n_u,) to x_next, of
+    whose entries the last n_v are velocities.
+
+    Its LCS is built about the state half-way, x: forces and accelerations there are
+    those of the step to second order in dt (about x_now: to first order, which takes
+    an arm's own motion for a mass).
+    """
+
+    x_now: np.ndarray
+    u: np.ndarray
+    x_next: np.ndarray
+    v_mean: np.ndarray  # (n_v,) velocity that the change of the positions was.
+    M: np.ndarray  # (n_v, n_v) mass matrix half-way.
+
+    @property
+    def x(self) -> np.ndarray:
+        """(n_x,) half-way; its velocity is the mean of the step, whose damping is then
+        exact also where an impact is in it."""
+        x = 0.5 * (self.x_now + self.x_next)
+        x[-self.v_mean.size :] = self.v_mean
+        return x
+
+
+@dataclass(frozen=True)
+class Loss:
+    """W (n_x, n_x) inverse covariance of the one-step errors; eps, gamma as in residual_learner.py; slip_noise of
+    opening_speed."""
+
+    W: np.ndarray
+    eps: float
+    gamma: float
+    slip_noise: float
+
+
+@dataclass(frozen=True, eq=False)
+class Explained:
+    """A step under some parameters: its loss, and the forces that explain it best."""
+
+    lcs: LCS
+    loss: float
+    lam: np.ndarray  # (n_lam,) [N]
+    eta: np.ndarray  # (n_lam,) [m/s]
+    force: np.ndarray  # (n_lam,) [N] eps times the loss's derivative in the gap speed
+
+
+def step_of(lcs: LCS, sample: Sample, loss: Loss):
+    """(n_x,), (n_lam,) what the model about the middle lacks of the measured change
+    without contact forces, and the gap velocities at the end without them."""
+    x, n_v = sample.x, sample.v_mean.size
+    v_now, v_next = sample.x_now[-n_v:], sample.x_next[-n_v:]
+    lacks = lcs.A @ x + lcs.B @ sample.u + lcs.d - x
+    lacks -= sample.x_next - sample.x_now
+    # A contact that pushes is closed at one end of the step at least: its row has the
+    # smaller of the gaps there, instead of one that the end's velocity extrapolates.
+    w = lcs.E @ x + lcs.H @ sample.u + lcs.c - lcs.J @ (sample.v_mean - v_now)
+    w -= 0.5 * abs(normal_speed(lcs, sample.v_mean)) + normal_speed(lcs, v_next)
+    return lacks, w + opening_speed(lcs, sample.x_next, loss.slip_noise)
+
+
+def error_weights(Q_d, share, lacks, M, turned=0.0) -> np.ndarray:
+    """(n_x, n_x) inverse covariance of a step's errors.
+
+    Args: Q_d (n_x,) inverse variances that do not depend on the step; lacks (n_x,): the
+        measured change that is not that of free motion; share: further error in parts
+        of the size of `lacks`, as the mass matrix M (n_v, n_v) measures it, in any
+        direction; turned (n_v,): change of the velocities that the forces make if they
+        act at the step's end instead of its beginning, as when they act is not known.
+    """
+    n_v = len(M)
+    W = np.diag(np.asarray(Q_d, dtype=float))
+    size = share**2 * (lacks[-n_v:] @ M @ lacks[-n_v:]) / n_v
+    more = size * np.linalg.inv(M) + np.outer(turned, turned) / 12.0
+    if more.any():  # (1 / Q + more)^-1, as Q may be zero.
+        Q = W[-n_v:, -n_v:]
+        W[-n_v:, -n_v:] = Q @ np.linalg.inv(np.eye(n_v) + more @ Q)
+    return W
+
+
+def root_of(W) -> np.ndarray:
+    """(n, n) R with R' R = W, which is positive semi-definite."""
+    values, vectors = np.linalg.eigh(W)
+    return np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+
+
+def impact_part(lcs: LCS, sample: Sample, lacks) -> float:
+    """Which part, 0 to 1, of the energy of the change `lacks` (n_x,) is that of contacts
+    whose bodies meet or part in the step: nothing while they move together."""
+    n_v = sample.v_mean.size
+    dv, energy = (sample.x_next - sample.x_now)[-n_v:], 0.0
+    for contact in np.unique(lcs.contact):
+        of = (lcs.contact == contact) & np.isfinite(lcs.phi)
+        if of.any():
+            normal = lcs.J[of].mean(axis=0)
+            mobility = normal @ np.linalg.solve(sample.M, normal)
+            if mobility > 0.0:
+                energy = max(energy, (normal @ dv) ** 2 / mobility)
+    whole = lacks[-n_v:] @ sample.M @ lacks[-n_v:]
+    return float(min(energy / whole, 1.0)) if whole > 0.0 else 0.0
+
+
+def normal_speed(lcs: LCS, v) -> np.ndarray:
+    """(n_lam,) rate of each row's gap [m/s]; zero where w holds no gap."""
+    along, rate = lcs.J @ v, np.zeros(lcs.n_lam)
+    for contact in np.unique(lcs.contact):
+        of = (lcs.contact == contact) & np.isfinite(lcs.phi)
+        if of.any():
+            rate[of] = along[of].mean()  # The edges come in opposite pairs.
+    return rate
+
+
+def explain(lcs: LCS, sample: Sample, loss: Loss) -> Explained | None:
+    """The forces of the violation-based loss; None where its QP was not solved."""
+    z, q = step_of(lcs, sample, loss)
+    weighted = loss.eps * lcs.D.T @ loss.W
+    P, p = weighted @ lcs.D, weighted @ z
+    if not (np.isfinite(P).all() and np.isfinite(p).all() and np.isfinite(q).all()):
+        return None
+    solved, cost, lam, eta, force = solve_step(P, p, lcs.F, q, loss.gamma)
+    total = float(0.5 * z @ loss.W @ z + cost / loss.eps)
+    if not (solved and np.isfinite(total)):
+        return None
+    return Explained(lcs, total, lam, eta, force)
+
+
+def changes_by(lcs: LCS, other: LCS, sample: Sample, loss: Loss, lam):
+    """(n_x,), (n_lam,) how x_next and the gap velocities differ in another LCS, at the
+    forces lam."""
+    (z, q), (z_other, q_other) = (step_of(of, sample, loss) for of in (lcs, other))
+    dD, dF = other.D - lcs.D, other.F - lcs.F
+    return z_other - z + dD @ lam, q_other - q + dF @ lam
+
+
+def gradient_and_information(found: Explained, sample: Sample, loss: Loss, dx, dw):
+    """The loss's gradient (n,) and Gauss-Newton Hessian (n, n).
+
+    Args: dx (n_x, n), dw (n_lam, n): derivatives of x_next and of the gap velocities
+        at the forces found.
+    """
+    lcs = found.lcs
+    error = loss.W @ (step_of(lcs, sample, loss)[0] + lcs.D @ found.lam)
+    gradient = dx.T @ error + dw.T @ found.force / loss.eps
+    root, stiff = root_of(loss.W), 1.0 / np.sqrt(loss.eps * loss.gamma)
+    closed, free = found.eta == 0.0, found.lam > 0.0
+    of_z = np.vstack([root @ dx, stiff * dw[closed]])
+    of_lam = np.vstack([root @ lcs.D[:, free], stiff * lcs.F[np.ix_(closed, free)]])
+    if free.any():
+        basis, _ = np.linalg.qr(of_lam)
+        of_z = of_z - basis @ (basis.T @ of_z)
+    return gradient, of_z.T @ of_z
+
+
+def updated(
+    belief: Belief,
+    sample: Sample,
+    loss: Loss,
+    trust: float,
+    build: Callable[[np.ndarray], LCS],
+    changes: Callable[[np.ndarray, LCS, np.ndarray], tuple[np.ndarray, np.ndarray]],
+    starts=(),
+) -> tuple[Belief, Explained | None]:
+    """The belief after a step, and the step as the new mean explains it.
+
+    Args:
+        trust: factor on the loss.
+        build: the LCS about the sample's x and u for z (n,).
+        changes: for z, its LCS and the forces: dx and dw by z.
+        starts: further z from which the minimum is looked for, as the loss is flat
+            where a contact is missed; the best one is taken.
+    Returns: the belief as it was, and None, where no QP was solved.
+    """
+
+    def tried(z):
+        try:
+            found = explain(build(z), sample, loss)
+        except ValueError:
+            return None
+        if found is None:
+            return None
+        off = z - belief.mean
+        return z, found, 0.5 * off @ belief.information @ off + trust * found.loss
+
+    begun = [each for each in map(tried, (belief.mean, *starts)) if each is not None]
+    if not begun:
+        return belief, None
+    z, found, cost = min(begun, key=lambda each: each[2])
+    more = np.zeros_like(belief.information)
+    for _ in range(NEWTON_STEPS):
+        dx, dw = changes(z, found.lcs, found.lam)
+        gradient, information = gradient_and_information(found, sample, loss, dx, dw)
+        more = trust * information
+        slope = belief.information @ (z - belief.mean) + trust * gradient
+        step = -np.linalg.solve(belief.information + more, slope)
+        for _ in range(HALVINGS):
+            trial = tried(z + step)
+            if trial is not None and trial[2] < cost:
+                break
+            step, trial = 0.5 * step, None
+        if trial is None:
+            break
+        z, found, cost = trial
+        if np.abs(step).max() < SMALL:
+            break
+    return Belief(z, belief.information + more), found
+
+
+def drifted(belief: Belief, variance) -> Belief:
+    """The belief a moment later, (n,) of which variance is new; never less certain
+    than the model."""
+    if not np.any(variance):
+        return belief
+    covariance = np.linalg.inv(belief.information)
+    room = np.clip(1.0 - np.diag(covariance), 0.0, None)
+    covariance = covariance + np.diag(np.minimum(variance, room))
+    return Belief(belief.mean.copy(), np.linalg.inv(covariance))
+
+
+def certain_part(belief: Belief) -> np.ndarray:
+    """z (n,) to act on: the mean, less where it is not known.
+
+    Along each principal direction of the belief the mean a with deviation s is taken
+    (1 - s^2 / a^2) times, within one deviation of the model's value not at all. So a
+    ratio of two parameters that is known is acted on though neither of them is.
+    """
+    information, directions = np.linalg.eigh(belief.information)
+    along = directions.T @ belief.mean
+    share = 1.0 - 1.0 / np.maximum(information * along**2, 1.0)
+    return directions @ (share * along)

@@ -1,0 +1,232 @@
+"""The learner of named parameters as a system (numerics/parameter_posterior.py)."""
+
+from dataclasses import dataclass, field, replace
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+from pydrake.common.value import Value
+from pydrake.systems.framework import LeafSystem
+
+from makebreak.systems.contact_mpc.multibody.anitescu_lcs import AnitescuLcs
+from makebreak.systems.contact_mpc.multibody.contact_pair import ContactPair
+from makebreak.systems.contact_mpc.multibody.model_parameters import (
+    POSITIVE,
+    Parameter,
+)
+from makebreak.systems.contact_mpc.numerics.parameter_posterior import (
+    Belief,
+    Loss,
+    Sample,
+    Scale,
+    certain_part,
+    changes_by,
+    drifted,
+    error_weights,
+    explain,
+    impact_part,
+    prior,
+    step_of,
+    updated,
+)
+from makebreak.systems.contact_mpc.numerics.residual_learner import gamma_bound
+from makebreak.systems.numerics.settings import check_settings, check_times
+from makebreak.systems.numerics.timing import timed
+
+DIFFERENCE = 1e-6  # Of a friction, or of a gap [m], for its derivatives.
+GAP_STARTS = (-2.0, -1.0, 1.0, 2.0)  # Deviations of a gap to look for contact at.
+
+
+class ParameterStatus(IntEnum):
+    """What happened to the newest step."""
+
+    LEARNED = 0
+    WAITING = 1  # No step yet: it takes two good samples in a row.
+    DISABLED = 2  # enable was 0.
+    NOT_FINITE = 3  # x or u_measured was not finite, or too large.
+    NOT_SOLVED = 4  # No LCS about x, or a QP was not solved.
+
+
+@dataclass
+class ParameterLearnerConfig:
+    contacts: list[ContactPair] = field(default_factory=list)
+    parameters: list[Parameter] = field(default_factory=list)
+    # Inverse variances (n_x,) of the one-step errors [1/SI^2]; empty: 1e4 for each
+    # velocity (1 cm/s), 0 for the positions.
+    Q_d: list[float] = field(default_factory=list)
+    # Standard deviation of a closed contact's gap speed [m/s].
+    contact_std: float = 0.02
+    # Standard deviation of a step's error, in parts of what contact forces and other
+    # things that free motion lacks have changed in it.
+    error_share: float = 0.1
+    impact_share: float = 0.5  # The same of impacts, of which no law is exact.
+    trust: float = 0.5  # Factor on the loss of a step: errors of steps are correlated.
+    loss_max: float = 20.0  # Loss of a step beyond which its weight falls.
+    slip_noise: float = 0.0  # Of the measured sliding speed [m/s], see opening_speed.
+    closest: int | None = None  # As of AnitescuLcs.
+
+
+@dataclass(frozen=True, eq=False)
+class _Memory:
+    sample: np.ndarray | None
+    belief: Belief
+    loss: float
+    status: ParameterStatus
+
+    def __deepcopy__(self, memo):
+        return self  # Every part is immutable.
+
+
+class ParameterLearner(LeafSystem):
+    """Learns masses, centres of mass, damping, friction and gaps while the robot works.
+
+    Inputs:  x (n_x,): measured state; u_measured (n_u,): mean of the input over the
+             period that ends now; enable (1,), optional: 0 drops the steps that this
+             sample belongs to.
+    Outputs: parameters (n,): values to plan with, each as far from the model's as it is
+             certain; estimate (n,): the most probable values; std (n,): of z, so of the
+             logarithm times the parameter's std for masses, damping and friction, else
+             in units of it; loss (1,): of the newest step; status (1,): a
+             ParameterStatus.
+
+    The learner builds its own LCS about each measured state, with dt = period_sec, so
+    its rate does not depend on the planner's.
+
+    Args: diagram: the controller's plant and scene graph (AnitescuLcs); config.
+    Raises: ValueError for a parameter that the model does not have.
+    """
+
+    def __init__(
+        self,
+        diagram,
+        config: ParameterLearnerConfig,
+        period_sec: float,
+        offset_sec: float = 0.0,
+    ):
+        super().__init__()
+        check_settings(config)
+        check_times("ParameterLearner", period_sec, offset_sec)
+        c = config
+        if not c.parameters:
+            raise ValueError("ParameterLearnerConfig.parameters is empty")
+        self.model = m = AnitescuLcs(
+            diagram,
+            c.contacts,
+            period_sec,
+            closest=c.closest,
+            parameters=c.parameters,
+        )
+        Q_d = np.array(c.Q_d or [0.0] * m.n_q + [1e4] * m.n_v, dtype=float)
+        if Q_d.shape != (m.n_x,) or not (Q_d >= 0.0).all():
+            raise ValueError(
+                f"ParameterLearnerConfig.Q_d is {c.Q_d}, expected {m.n_x} numbers of "
+                "at least 0"
+            )
+        gamma = min(m.eps_c, 0.5 * gamma_bound(m.at_default().F))
+        self._Q_d = Q_d
+        # The loss has |gap speed|^2 / (2 eps gamma) of a closed contact.
+        self._loss = Loss(
+            np.diag(Q_d), c.contact_std**2 / gamma, gamma, c.slip_noise
+        )
+        self._scale = Scale(
+            m.parameters.nominal,
+            np.array([p.std for p in c.parameters]),
+            np.array([p.kind in POSITIVE for p in c.parameters]),
+        )
+        self._drift = np.array([p.drift for p in c.parameters]) ** 2 * period_sec
+        self._config, n = c, len(c.parameters)
+        self._x = self.DeclareVectorInputPort("x", m.n_x)
+        self._u = self.DeclareVectorInputPort("u_measured", m.n_u)
+        self._enable = self.DeclareVectorInputPort("enable", 1)
+        first = _Memory(None, prior(n), 0.0, ParameterStatus.WAITING)
+        self._memory = self.DeclareAbstractState(Value(first))
+        ticket = {self.abstract_state_ticket(self._memory)}
+
+        def output(name, size, value):
+            def calc(context, out):
+                out.set_value(np.atleast_1d(value(self._memory_of(context))))
+
+            self.DeclareVectorOutputPort(name, size, calc, ticket)
+
+        values = self._scale.values
+        output("parameters", n, lambda m: values(certain_part(m.belief)))
+        output("estimate", n, lambda m: values(m.belief.mean))
+        output("std", n, lambda m: m.belief.std)
+        output("loss", 1, lambda m: m.loss)
+        output("status", 1, lambda m: float(m.status))
+        self.DeclarePeriodicUnrestrictedUpdateEvent(
+            period_sec, offset_sec, self._update
+        )
+
+    def _memory_of(self, context) -> _Memory:
+        return context.get_abstract_state(int(self._memory)).get_value()
+
+    @timed
+    def _update(self, context, state):
+        memory = self._memory_of(context)
+        x, u = self._x.Eval(context).copy(), self._u.Eval(context)
+        enable: Any = [1.0]
+        if self._enable.HasValue(context):
+            enable = self._enable.Eval(context)
+        state.get_mutable_abstract_state(int(self._memory)).set_value(
+            self._after(memory, x, u, bool(enable[0] > 0.5))
+        )
+
+    def _after(self, memory: _Memory, x, u, enabled) -> _Memory:
+        """The memory after the sample x with the input u since the last one."""
+        if not enabled:
+            return replace(memory, sample=None, status=ParameterStatus.DISABLED)
+        if not np.isfinite(x).all():
+            return replace(memory, sample=None, status=ParameterStatus.NOT_FINITE)
+        x.setflags(write=False)
+        if memory.sample is None:
+            return replace(memory, sample=x, status=ParameterStatus.WAITING)
+        if not np.isfinite(u).all():
+            return replace(memory, sample=x, status=ParameterStatus.NOT_FINITE)
+        sample = Sample(memory.sample, u, x, *self.model.between(memory.sample, x))
+        belief, found = self._learned(memory.belief, sample)
+        if found is None:
+            return replace(memory, sample=x, status=ParameterStatus.NOT_SOLVED)
+        return _Memory(x, belief, found.loss, ParameterStatus.LEARNED)
+
+    def _learned(self, belief: Belief, sample: Sample):
+        c, scale, model = self._config, self._scale, self.model
+
+        def build(z):
+            return model.build(sample.x, sample.u, parameters=scale.values(z))
+
+        def changes(z, lcs, lam):
+            values = scale.values(z)
+            dx, dw = model.step_changes(sample.x, sample.u, lcs, lam, values)
+            for i in np.flatnonzero(~model.parameters.is_dynamic):
+                other = values.copy()
+                other[i] += DIFFERENCE
+                other = model.build(sample.x, sample.u, parameters=other)
+                both = changes_by(lcs, other, sample, loss, lam)
+                dx[:, i], dw[:, i] = both[0] / DIFFERENCE, both[1] / DIFFERENCE
+            return dx * scale.slopes(values), dw * scale.slopes(values)
+
+        lcs = build(belief.mean)
+        lacks, turned = step_of(lcs, sample, self._loss)[0], np.zeros(model.n_v)
+        begun = explain(lcs, sample, self._loss)
+        if begun is not None and begun.lam.any():
+            ends = [
+                model.build(each, sample.u, parameters=scale.values(belief.mean)).J
+                for each in (sample.x_now, sample.x_next)
+            ]
+            impulse = model.dt_sec * (ends[1] - ends[0]).T @ begun.lam
+            turned = np.linalg.solve(sample.M, impulse)
+        share = np.hypot(
+            c.error_share, c.impact_share * impact_part(lcs, sample, lacks) ** 0.5
+        )
+        W = error_weights(self._Q_d, share, lacks, sample.M, turned)
+        loss = replace(self._loss, W=W)
+        starts = []
+        for i, p in enumerate(c.parameters):
+            if p.kind == "gap":
+                for at in GAP_STARTS:
+                    start = belief.mean.copy()
+                    start[i] = at
+                    starts.append(start)
+        belief = drifted(belief, self._drift)
+        return updated(belief, sample, loss, c.trust, build, changes, starts)
