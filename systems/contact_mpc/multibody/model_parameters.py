@@ -7,7 +7,7 @@
     gap               what is added to the distances of a contact pair [m]
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
@@ -28,15 +28,16 @@ POSITIVE = ("mass", "damping", "friction")
 class Parameter:
     """A physical parameter of the model, and how well it is known.
 
-    kind: one of KINDS. of: name of the body or the joint, or the number of the contact
-    pair. std: standard deviation of what the model says, of the logarithm for mass,
+    kind: one of KINDS. of: name of the body or the joint. pairs: for friction and gap,
+    the numbers of the contact pairs that have the value. std: standard deviation of what the model says, of the logarithm for mass,
     damping and friction (0.5: by a factor of 1.6), else [m]. drift: how much of it may
     be new after one second, in deviations std per sqrt(s).
     """
 
     kind: str
-    of: str | int
     std: float
+    of: str = ""
+    pairs: list[int] = field(default_factory=list)
     drift: float = 0.0
 
 
@@ -51,11 +52,13 @@ class ModelParameters:
     def __init__(self, items, plant: MultibodyPlant, context: Context, pair_friction):
         self.items, self._plant = tuple(items), plant
         self.names = [f"{p.kind} of {_of(p)}" for p in self.items]
-        if len(set(self.names)) < len(self.names):
-            raise ValueError(f"a parameter came twice: {self.names}")
-        values = []
+        values, known = [], set()
         for p, name in zip(self.items, self.names, strict=True):
             _check(p, name, len(pair_friction))
+            of = {(p.kind, each) for each in p.pairs or [p.of]}
+            if of & known:
+                raise ValueError(f"{name} came twice: {self.names}")
+            known |= of
             values.append(_nominal(p, name, plant, context, pair_friction))
         self.nominal = np.array(values)
         self.is_dynamic = np.array([p.kind not in OF_PAIRS for p in self.items], bool)
@@ -70,7 +73,7 @@ class ModelParameters:
         out = np.array(default, dtype=float)
         for p, value in zip(self.items, values, strict=True):
             if p.kind == kind:
-                out[p.of] = value
+                out[p.pairs] = value
         return out
 
     def put(self, plant, context, values, scalar=float) -> None:
@@ -121,7 +124,7 @@ class ModelParameters:
 
 
 def _of(p: Parameter) -> str:
-    return f"pair {p.of}" if p.kind in OF_PAIRS else str(p.of)
+    return f"pairs {p.pairs}" if p.kind in OF_PAIRS else p.of
 
 
 def _check(p: Parameter, name: str, n_pairs: int) -> None:
@@ -131,15 +134,21 @@ def _check(p: Parameter, name: str, n_pairs: int) -> None:
         raise ValueError(f"{name}: std is {p.std}, expected a positive number")
     if not (np.isfinite(p.drift) and p.drift >= 0.0):
         raise ValueError(f"{name}: drift is {p.drift}, expected 0 or more")
-    if p.kind in OF_PAIRS and p.of not in range(n_pairs):
-        raise ValueError(f"{name}: expected the number of a pair, 0 to {n_pairs - 1}")
+    if p.kind in OF_PAIRS:
+        if not p.pairs or not all(pair in range(n_pairs) for pair in p.pairs):
+            raise ValueError(f"{name}: expected numbers of pairs, 0 to {n_pairs - 1}")
+    elif p.pairs:
+        raise ValueError(f"{name}: pairs is {p.pairs}, expected none")
 
 
 def _nominal(p: Parameter, name: str, plant, context, pair_friction) -> float:
     if p.kind == "gap":
         return 0.0
     if p.kind == "friction":
-        value = float(pair_friction[p.of])
+        different = {float(pair_friction[pair]) for pair in p.pairs}
+        if len(different) != 1:
+            raise ValueError(f"{name}: the pairs have {sorted(different)}, expected one")
+        value = different.pop()
     elif p.kind == "damping":
         if not plant.HasJointNamed(p.of):
             known = [plant.get_joint(i).name() for i in plant.GetJointIndices()]

@@ -1,0 +1,274 @@
+"""`makebreak bench parameter_learner`: what learning masses, friction and gaps is worth.
+
+Three plants whose planner's model is wrong: the error of the task without the learner,
+with it, and with the right model; how far the learned values are off, and how often
+their 90 % intervals hold the truth. The world is Drake at 1 ms steps.
+
+    door    a two-link arm pushes a door on a damped hinge to an angle, and lets it go
+    leg     a leg on a vertical rail falls, lands and holds its body at a height
+    box     two fingers push a box over a table, in a plane, to a place
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+
+from makebreak.benchmarks import plants as p
+from makebreak.diagrams.contact_mpc import ContactMpcConfig, make_contact_mpc
+from makebreak.systems.contact_mpc.lcs_builder import ContactPair
+from makebreak.systems.contact_mpc.multibody.model_parameters import (
+    POSITIVE,
+    Parameter,
+)
+from makebreak.systems.contact_mpc.numerics.c3_mpc import C3Bounds, C3Options
+from makebreak.systems.contact_mpc.parameter_learner import (
+    ParameterLearner,
+    ParameterLearnerConfig,
+)
+
+FACTORS = (0.5, 2.0)  # Between which the truth is that of the model.
+NINETY = 1.645  # Deviations of a 90 % interval.
+FIRST_SEED = 9000
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """A plant, what its planner wants, and what its model may be wrong about.
+
+    Args:
+        world: (values) -> SDF text. pairs: (friction of the values) -> of the LCS.
+        values: the model's. learned: the parameter of each.
+        q: positions at the start; x_desired, Q, R, N, dt, u_max: of the planner.
+        goal: index of the position whose final error counts, in `unit`s of 1e-3.
+    """
+
+    name: str
+    world: Callable[[dict], str]
+    pairs: Callable[[dict], list[ContactPair]]
+    values: dict[str, float]
+    learned: dict[str, Parameter]
+    q: Sequence[float]
+    x_desired: Sequence[float]
+    Q: Sequence[float]
+    R: Sequence[float]
+    goal: int
+    unit: str
+    N: int = 15
+    dt: float = 0.05
+    u_max: float = np.inf
+    seconds: float = 4.0
+
+
+def turning(child: str, parent: str, axis: str, damping: float, driven=True) -> str:
+    """A revolute joint at the child's origin."""
+    limit = "" if driven else "<limit><effort>0</effort></limit>"
+    return (
+        f'<joint name="{child}_joint" type="revolute"><parent>{parent}</parent>'
+        f"<child>{child}</child><axis><xyz>{axis}</xyz><dynamics><damping>{damping}"
+        f"</damping></dynamics>{limit}</axis></joint>"
+    )
+
+
+def bar(name: str, parent: str, at: str, mass: float, centre: str, ball="", arm=0.1):
+    """A link whose frame is at its joint; centre: of mass [m]; arm: of gyration [m]."""
+    moment = mass * arm**2
+    inertia = "".join(f"<{i}>{moment}</{i}>" for i in ("ixx", "iyy", "izz"))
+    of = f' relative_to="{parent}"' if parent != "world" else ""
+    return (
+        f'<link name="{name}"><pose{of}>{at} 0 0 0</pose><inertial><pose>{centre} 0 0 '
+        f"0</pose><mass>{mass}</mass><inertia>{inertia}</inertia></inertial>{ball}"
+        "</link>"
+    )
+
+
+def door_world(v: dict) -> str:
+    mu, length = v["friction"], "0.35 0 0"
+    tip = p.shape("ball", p.sphere(0.02), length, mu)
+    panel = p.shape("panel", p.box(0.03 - 2.0 * v["gap"], 0.4, 0.1), "0 0.2 0", mu)
+    return p.sdf(
+        bar("upper", "world", "0 0 0", 2.0, "0.175 0 0"),
+        turning("upper", "world", "0 0 1", 0.5),
+        bar("fore", "upper", length, 1.6, "0.19 0 0", tip),
+        turning("fore", "upper", "0 0 1", 0.5),
+        bar("door", "world", "0.5 -0.2 0", v["mass"], "0 0.2 0", panel, 0.12),
+        turning("door", "world", "0 0 1", v["damping"], driven=False),
+    )
+
+
+DOOR = Task(
+    "door", door_world,
+    lambda v: [ContactPair("fore", "door", v["friction"], 1, plane_normal=[0, 0, 1])],
+    {"mass": 2.0, "damping": 0.8, "friction": 0.4, "gap": 0.0},
+    {
+        "mass": Parameter("mass", 0.5, "door"),
+        "damping": Parameter("damping", 0.5, "door_joint"),
+        "friction": Parameter("friction", 0.5, pairs=[0]),
+        "gap": Parameter("gap", 0.003, pairs=[0]),
+    },
+    [1.0, -2.0, 0.0], [0.4, -0.2, -0.5, 0.0, 0.0, 0.0],
+    [0.0, 0.0, 300.0, 5.0, 5.0, 10.0], [0.02] * 2, 2, "mrad", N=20,
+)  # fmt: skip
+
+
+def leg_world(v: dict) -> str:
+    mu, foot = v["friction"], "0 0 -0.22"
+    ground = p.fixed("ground", p.box(2, 2, 1), f"0 0 {-0.5 - v['gap']}", mu)
+    ball = p.shape("foot", p.sphere(0.02), foot, mu)
+    return p.sdf(
+        ground,
+        bar("body", "world", "0 0 0", v["mass"], "0 0 0"),
+        p.joint("body", "0 0 1", driven=False),
+        bar("thigh", "body", "0 0 0", 0.6, "0 0 -0.1", arm=0.07),
+        turning("thigh", "body", "0 1 0", 0.1),
+        bar("shank", "thigh", foot, 0.25, "0 0 -0.12", ball, 0.07),
+        turning("shank", "thigh", "0 1 0", 0.1),
+    )
+
+
+def bent(height: float) -> list[float]:
+    """Hip and knee of the leg with its foot under it and its body at this height [m]."""
+    hip = float(np.arccos(height / 0.44))
+    return [hip, -2.0 * hip]
+
+
+LEG = Task(
+    "leg", leg_world,
+    lambda v: [ContactPair("shank", "ground", v["friction"], 1, plane_normal=[0, 1, 0])],
+    {"mass": 3.0, "friction": 0.6, "gap": 0.0},
+    {
+        "mass": Parameter("mass", 0.5, "body"),
+        "friction": Parameter("friction", 0.5, pairs=[0]),
+        "gap": Parameter("gap", 0.01, pairs=[0]),
+    },
+    [0.46, *bent(0.40)], [0.36, *bent(0.34), 0.0, 0.0, 0.0],
+    [400.0, 50.0, 50.0, 2.0, 1.0, 1.0], [0.002] * 2, 0, "mm", N=15, dt=0.02, u_max=40.0,
+)  # fmt: skip
+
+
+def box_world(v: dict) -> str:
+    mu, half = v["friction"], 0.04 - v["gap"]
+    shapes = p.shape("sides", p.box(2 * half, 2 * half, 0.05), mu=mu)
+    shapes += p.feet(0.06, -0.021, 0.004, mu)
+    text = p.ground(mu) + p.finger("tip", p.XY, "0 0 0.025", 0.02, 0.3, damping=2.0)
+    return p.sdf(text, p.link("box", v["mass"], shapes, arm=0.027))
+
+
+BOX = Task(
+    "box", box_world,
+    lambda v: [ContactPair("tip", "m::sides", v["friction"], 2), *p.on_feet(v["friction"])],
+    {"mass": 0.4, "friction": 0.4, "gap": 0.0},
+    {
+        "mass": Parameter("mass", 0.5, "box"),
+        "friction": Parameter("friction", 0.5, pairs=[0, 1, 2, 3, 4]),
+        "gap": Parameter("gap", 0.003, pairs=[0]),
+    },
+    [-0.07, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0251],
+    [0.14, 0.0, 1.0, 0.0, 0.0, 0.0, 0.2, 0.0, 0.0251, *[0.0] * 8],
+    [0.0, 0.0, *[0.0] * 4, 500.0, 500.0, 0.0, 1.0, 1.0, *[0.0] * 3, 5.0, 5.0, 0.0],
+    [0.01] * 2, 6, "mm", N=10,
+)  # fmt: skip
+TASKS = {task.name: task for task in (DOOR, LEG, BOX)}
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """error: of the task at the end; the learned values and deviations of z, or None;
+    parts (n,): deviations of the truth from what was learned."""
+
+    error: float
+    values: np.ndarray | None = None
+    off: np.ndarray | None = None
+
+
+def run(task: Task, true: dict, knows: bool, learns: bool) -> Run:
+    """Args: true: the world's values; knows: whether the planner's model has them."""
+    own = true if knows else task.values
+    (model, _), builder = p.diagram_of(task.world(own)), DiagramBuilder()
+    plant, _ = AddMultibodyPlantSceneGraph(builder, 0.001)
+    Parser(plant).AddModelsFromString(task.world(true), "sdf")
+    plant.Finalize()
+    pairs, n_u = task.pairs(own), plant.num_actuated_dofs()
+    items = list(task.learned.values()) if learns else []
+    limit = [task.u_max] * n_u
+    config = ContactMpcConfig(
+        pairs, list(task.Q), list(task.R), list(task.x_desired), task.dt, task.dt,
+        C3Options(N=task.N, rounds=5, polish=3), C3Bounds([-u for u in limit], limit),
+        parameters=items,
+    )  # fmt: skip
+    mpc = builder.AddSystem(make_contact_mpc(model, config))
+    state = plant.get_state_output_port()
+    builder.Connect(state, mpc.GetInputPort("x"))
+    builder.Connect(mpc.GetOutputPort("u"), plant.get_actuation_input_port())
+    learner = None
+    if learns:
+        learner = builder.AddSystem(
+            ParameterLearner(
+                model, ParameterLearnerConfig(pairs, items), task.dt, offset_sec=5e-5
+            )
+        )
+        builder.Connect(state, learner.GetInputPort("x"))
+        builder.Connect(mpc.GetOutputPort("u"), learner.GetInputPort("u_measured"))
+        builder.Connect(
+            learner.GetOutputPort("parameters"), mpc.GetInputPort("parameters")
+        )
+    simulator = Simulator(builder.Build())
+    context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+    plant.SetPositions(context, task.q)
+    simulator.AdvanceTo(task.seconds)
+    error = plant.GetPositions(context)[task.goal] - task.x_desired[task.goal]
+    if learner is None:
+        return Run(1e3 * abs(error))
+    own_context = learner.GetMyContextFromRoot(simulator.get_context())
+    values, std = (
+        learner.GetOutputPort(name).Eval(own_context) for name in ("estimate", "std")
+    )
+    off = []
+    for item, value, right in zip(items, values, true.values(), strict=True):
+        far = np.log(value / right) if item.kind in POSITIVE else value - right
+        off.append(far / item.std)
+    return Run(1e3 * abs(error), values, np.array(off) / std)
+
+
+def drawn(task: Task, seed: int) -> dict:
+    """Values of a world in which one or two are not the model's."""
+    rng = np.random.default_rng(seed)
+    true = dict(task.values)
+    for name in rng.choice(list(true), size=rng.integers(1, 3), replace=False):
+        if name == "gap":
+            true[name] = float(rng.normal() * task.learned[name].std)
+        else:
+            true[name] *= float(np.exp(rng.uniform(*np.log(FACTORS))))
+    return true
+
+
+def row(task: Task, seeds: Sequence[int]) -> dict:
+    """The row of a plant: medians over seeds, and the coverage of the intervals."""
+    ratios, offs, errors = [], [], []
+    for seed in seeds:
+        true = drawn(task, seed)
+        without, learned, right = (
+            run(task, true, knows, learns)
+            for knows, learns in ((False, False), (False, True), (True, False))
+        )
+        errors.append([without.error, learned.error, right.error])
+        offs.append(learned.off)
+    off = np.abs(offs)
+    without, learned, right = np.median(errors, axis=0)
+    return {
+        "what": f"{task.name}, {len(seeds)} wrong models: error with the learner",
+        "value": float(learned),
+        "unit": task.unit,
+        "without": float(without),
+        "right_model": float(right),
+        "worst": [round(float(e), 1) for e in np.max(errors, axis=0)],
+        "within_90": float(np.mean(off < NINETY)),
+    }
+
+
+def rows(seeds: Sequence[int] = range(FIRST_SEED, FIRST_SEED + 20)) -> list[dict]:
+    return [row(task, seeds) for task in TASKS.values()]
