@@ -29,8 +29,9 @@ BENCHES: dict[str, str] = {
     "gap": "makebreak.benchmarks.gap",
     "c3_light": "makebreak.benchmarks.c3_light",
     "learner_plants": "makebreak.benchmarks.learner_plants",
+    "parameter_learner": "makebreak.benchmarks.parameter_learner",
 }
-NAMED_ONLY = ("c3_light", "learner_plants")
+NAMED_ONLY = ("c3_light", "learner_plants", "parameter_learner")
 
 
 def median_call_ms(

@@ -1,4 +1,4 @@
-"""`makebreak bench parameter_learner`: what learning masses, friction and gaps is worth.
+"""`makebreak bench parameter_learner`: what it is worth to learn masses and friction.
 
 Three plants whose planner's model is wrong: the error of the task without the learner,
 with it, and with the right model; how far the learned values are off, and how often
@@ -131,14 +131,14 @@ def leg_world(v: dict) -> str:
 
 
 def bent(height: float) -> list[float]:
-    """Hip and knee of the leg with its foot under it and its body at this height [m]."""
+    """Hip and knee of the leg with its foot under its hip at this height [m]."""
     hip = float(np.arccos(height / 0.44))
     return [hip, -2.0 * hip]
 
 
 LEG = Task(
     "leg", leg_world,
-    lambda v: [ContactPair("shank", "ground", v["friction"], 1, plane_normal=[0, 1, 0])],
+    lambda v: [p.in_plane("shank", "ground", v["friction"])],
     {"mass": 3.0, "friction": 0.6, "gap": 0.0},
     {
         "mass": Parameter("mass", 0.5, "body"),
@@ -160,7 +160,8 @@ def box_world(v: dict) -> str:
 
 BOX = Task(
     "box", box_world,
-    lambda v: [ContactPair("tip", "m::sides", v["friction"], 2), *p.on_feet(v["friction"])],
+    lambda v: [ContactPair("tip", "m::sides", v["friction"]),
+               *p.on_feet(v["friction"])],
     {"mass": 0.4, "friction": 0.4, "gap": 0.0},
     {
         "mass": Parameter("mass", 0.5, "box"),
@@ -248,7 +249,7 @@ def drawn(task: Task, seed: int) -> dict:
 
 def row(task: Task, seeds: Sequence[int]) -> dict:
     """The row of a plant: medians over seeds, and the coverage of the intervals."""
-    ratios, offs, errors = [], [], []
+    offs, errors = [], []
     for seed in seeds:
         true = drawn(task, seed)
         without, learned, right = (

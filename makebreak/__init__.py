@@ -77,6 +77,13 @@ if TYPE_CHECKING:
         LCS as LCS,
         simulate as simulate,
     )
+    from makebreak.systems.contact_mpc.multibody.model_parameters import (
+        Parameter as Parameter,
+    )
+    from makebreak.systems.contact_mpc.parameter_learner import (
+        ParameterLearner as ParameterLearner,
+        ParameterLearnerConfig as ParameterLearnerConfig,
+    )
     from makebreak.systems.contact_mpc.residual_learner import (
         PosteriorConfig as PosteriorConfig,
         ResidualLearner as ResidualLearner,

@@ -34,6 +34,7 @@ from makebreak.systems.numerics.settings import check_settings, check_times
 from makebreak.systems.numerics.timing import timed
 
 DIFFERENCE = 1e-6  # Of a friction, or of a gap [m], for its derivatives.
+NINETY = 1.645  # Deviations of a 90 % interval.
 GAP_STARTS = (-2.0, -1.0, 1.0, 2.0)  # Deviations of a gap to look for contact at.
 
 
@@ -61,9 +62,20 @@ class ParameterLearnerConfig:
     error_share: float = 0.1
     impact_share: float = 0.5  # The same of impacts, of which no law is exact.
     trust: float = 0.5  # Factor on the loss of a step: errors of steps are correlated.
-    loss_max: float = 20.0  # Loss of a step beyond which its weight falls.
     slip_noise: float = 0.0  # Of the measured sliding speed [m/s], see opening_speed.
     closest: int | None = None  # As of AnitescuLcs.
+
+
+@dataclass(frozen=True)
+class LearnedParameter:
+    """The model's value, the learned one, and the ends of its 90 % interval, in the
+    parameter's unit."""
+
+    name: str
+    model: float
+    learned: float
+    low: float
+    high: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +121,17 @@ class ParameterLearner(LeafSystem):
         c = config
         if not c.parameters:
             raise ValueError("ParameterLearnerConfig.parameters is empty")
+        for name, least, what in (
+            ("contact_std", 1e-300, "a positive number"),
+            ("trust", 1e-300, "a positive number"),
+            ("error_share", 0.0, "0 or more"),
+            ("impact_share", 0.0, "0 or more"),
+        ):
+            if not getattr(c, name) >= least:
+                raise ValueError(
+                    f"ParameterLearnerConfig.{name} is {getattr(c, name)}, expected "
+                    f"{what}"
+                )
         self.model = m = AnitescuLcs(
             diagram,
             c.contacts,
@@ -125,9 +148,7 @@ class ParameterLearner(LeafSystem):
         gamma = min(m.eps_c, 0.5 * gamma_bound(m.at_default().F))
         self._Q_d = Q_d
         # The loss has |gap speed|^2 / (2 eps gamma) of a closed contact.
-        self._loss = Loss(
-            np.diag(Q_d), c.contact_std**2 / gamma, gamma, c.slip_noise
-        )
+        self._loss = Loss(np.diag(Q_d), c.contact_std**2 / gamma, gamma, c.slip_noise)
         self._scale = Scale(
             m.parameters.nominal,
             np.array([p.std for p in c.parameters]),
@@ -157,6 +178,20 @@ class ParameterLearner(LeafSystem):
         self.DeclarePeriodicUnrestrictedUpdateEvent(
             period_sec, offset_sec, self._update
         )
+
+    def learned(self, context) -> list[LearnedParameter]:
+        """What is known of each parameter, in a context of this system."""
+        belief, scale = self._memory_of(context).belief, self._scale
+        reach = NINETY * belief.std
+        rows = zip(
+            self.model.parameters.names,
+            scale.nominal,
+            scale.values(belief.mean),
+            scale.values(belief.mean - reach),
+            scale.values(belief.mean + reach),
+            strict=True,
+        )
+        return [LearnedParameter(name, *map(float, row)) for name, *row in rows]
 
     def _memory_of(self, context) -> _Memory:
         return context.get_abstract_state(int(self._memory)).get_value()
@@ -206,20 +241,10 @@ class ParameterLearner(LeafSystem):
                 dx[:, i], dw[:, i] = both[0] / DIFFERENCE, both[1] / DIFFERENCE
             return dx * scale.slopes(values), dw * scale.slopes(values)
 
-        lcs = build(belief.mean)
-        lacks, turned = step_of(lcs, sample, self._loss)[0], np.zeros(model.n_v)
-        begun = explain(lcs, sample, self._loss)
-        if begun is not None and begun.lam.any():
-            ends = [
-                model.build(each, sample.u, parameters=scale.values(belief.mean)).J
-                for each in (sample.x_now, sample.x_next)
-            ]
-            impulse = model.dt_sec * (ends[1] - ends[0]).T @ begun.lam
-            turned = np.linalg.solve(sample.M, impulse)
-        share = np.hypot(
-            c.error_share, c.impact_share * impact_part(lcs, sample, lacks) ** 0.5
-        )
-        W = error_weights(self._Q_d, share, lacks, sample.M, turned)
+        try:
+            W = self._weights(belief, sample, build)
+        except (ValueError, RuntimeError):  # No LCS about these states.
+            return belief, None
         loss = replace(self._loss, W=W)
         starts = []
         for i, p in enumerate(c.parameters):
@@ -230,3 +255,21 @@ class ParameterLearner(LeafSystem):
                     starts.append(start)
         belief = drifted(belief, self._drift)
         return updated(belief, sample, loss, c.trust, build, changes, starts)
+
+    def _weights(self, belief: Belief, sample: Sample, build) -> np.ndarray:
+        """(n_x, n_x) of the step's errors, by what the forces under the belief do."""
+        c, model = self._config, self.model
+        lcs = build(belief.mean)
+        lacks, turned = step_of(lcs, sample, self._loss)[0], np.zeros(model.n_v)
+        found = explain(lcs, sample, self._loss)
+        if found is not None and found.lam.any():
+            values = self._scale.values(belief.mean)
+            before, after = (
+                model.build(x, sample.u, parameters=values).J
+                for x in (sample.x_now, sample.x_next)
+            )
+            impulse = model.dt_sec * (after - before).T @ found.lam
+            turned = np.linalg.solve(sample.M, impulse)
+        impacts = c.impact_share**2 * impact_part(lcs, sample, lacks)
+        share = np.sqrt(c.error_share**2 + impacts)
+        return error_weights(self._Q_d, share, lacks, sample.M, turned)

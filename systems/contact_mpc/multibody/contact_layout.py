@@ -28,7 +28,8 @@ class ContactLayout:
         geometries, names, mu, reference, planar: as of Contact.
         every: (n,) 0, 1, ..., n - 1.
     Others:
-        n_pairs, n_lam: sizes; mu_of_pairs (n_pairs,). chooses: whether the LCS has only the nearest contacts.
+        n_pairs, n_lam: sizes; mu_of_pairs (n_pairs,), as configured. chooses: whether
+            the LCS has only the nearest contacts.
         groups_in_arrays: for compiled callers (nearest_of_groups); None where friction
             may differ within a group.
         rows: ContactRows; lam_names: of each row.

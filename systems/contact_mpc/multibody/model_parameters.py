@@ -1,10 +1,10 @@
 """Physical parameters of an LCS's plant and contacts, and how a step depends on them.
 
-    mass              of a body [kg]; its inertia is in proportion, about its own centre
-    com_x, _y, _z     its centre of mass in its frame [m]
-    damping           of a joint [N m s/rad], or [N s/m]
-    friction          Coulomb's coefficient of a contact pair
-    gap               what is added to the distances of a contact pair [m]
+mass              of a body [kg]; its inertia is in proportion, about its own centre
+com_x, _y, _z     its centre of mass in its frame [m]
+damping           of a joint [N m s/rad], or [N s/m]
+friction          Coulomb's coefficient of a contact pair
+gap               what is added to the distances of a contact pair [m]
 """
 
 from dataclasses import dataclass, field
@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
+    BodyIndex,
     MultibodyForces,
     RotationalInertia_,
     SpatialInertia_,
@@ -28,10 +29,11 @@ POSITIVE = ("mass", "damping", "friction")
 class Parameter:
     """A physical parameter of the model, and how well it is known.
 
-    kind: one of KINDS. of: name of the body or the joint. pairs: for friction and gap,
-    the numbers of the contact pairs that have the value. std: standard deviation of what the model says, of the logarithm for mass,
-    damping and friction (0.5: by a factor of 1.6), else [m]. drift: how much of it may
-    be new after one second, in deviations std per sqrt(s).
+    kind: one of KINDS. std: standard deviation of what the model says, of the logarithm
+    for mass, damping and friction (0.5: by a factor of 1.6), else [m]. of: name of the
+    body or the joint. pairs: for friction and gap, the numbers of the contact pairs
+    that have the value. drift: how much of it may be new after one second, in
+    deviations std per sqrt(s).
     """
 
     kind: str
@@ -147,7 +149,9 @@ def _nominal(p: Parameter, name: str, plant, context, pair_friction) -> float:
     if p.kind == "friction":
         different = {float(pair_friction[pair]) for pair in p.pairs}
         if len(different) != 1:
-            raise ValueError(f"{name}: the pairs have {sorted(different)}, expected one")
+            raise ValueError(
+                f"{name}: the pairs have {sorted(different)}, expected one"
+            )
         value = different.pop()
     elif p.kind == "damping":
         if not plant.HasJointNamed(p.of):
@@ -159,7 +163,8 @@ def _nominal(p: Parameter, name: str, plant, context, pair_friction) -> float:
         value = float(vector[0])
     else:
         if not plant.HasBodyNamed(p.of):
-            known = [plant.get_body(i).name() for i in plant.GetBodyIndices()]
+            bodies = map(BodyIndex, range(plant.num_bodies()))
+            known = [plant.get_body(i).name() for i in bodies]
             raise ValueError(f"{name}: no such body, expected one of {known}")
         inertia = plant.GetBodyByName(p.of).default_spatial_inertia()
         if p.kind.startswith("com_"):

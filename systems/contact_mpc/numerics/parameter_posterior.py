@@ -104,8 +104,8 @@ class Sample:
 
 @dataclass(frozen=True)
 class Loss:
-    """W (n_x, n_x) inverse covariance of the one-step errors; eps, gamma as in residual_learner.py; slip_noise of
-    opening_speed."""
+    """W (n_x, n_x) inverse covariance of the one-step errors; eps, gamma as in
+    residual_learner.py; slip_noise of opening_speed."""
 
     W: np.ndarray
     eps: float
@@ -164,8 +164,8 @@ def root_of(W) -> np.ndarray:
 
 
 def impact_part(lcs: LCS, sample: Sample, lacks) -> float:
-    """Which part, 0 to 1, of the energy of the change `lacks` (n_x,) is that of contacts
-    whose bodies meet or part in the step: nothing while they move together."""
+    """Part, 0 to 1, of the energy of the change `lacks` (n_x,) that is of contacts whose
+    bodies meet or part in the step: nothing while they move together."""
     n_v = sample.v_mean.size
     dv, energy = (sample.x_next - sample.x_now)[-n_v:], 0.0
     for contact in np.unique(lcs.contact):
@@ -253,7 +253,7 @@ def updated(
     def tried(z):
         try:
             found = explain(build(z), sample, loss)
-        except ValueError:
+        except (ValueError, RuntimeError):
             return None
         if found is None:
             return None

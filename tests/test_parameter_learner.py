@@ -1,0 +1,386 @@
+"""The learner of named parameters: its maths, then the system beside wrong plants."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
+from pydrake.systems.primitives import ConstantVectorSource
+
+from makebreak.benchmarks import parameter_learner as bench
+from makebreak.benchmarks.plants import diagram_of
+from makebreak.systems.contact_mpc.lcs_builder import (
+    AnitescuLcs,
+    AnitescuLcsBuilder,
+    LcsBuilderConfig,
+)
+from makebreak.systems.contact_mpc.multibody.model_parameters import Parameter
+from makebreak.systems.contact_mpc.numerics.lcs import LCS
+from makebreak.systems.contact_mpc.numerics.parameter_posterior import (
+    Belief,
+    Loss,
+    Sample,
+    Scale,
+    certain_part,
+    drifted,
+    error_weights,
+    explain,
+    gradient_and_information,
+    prior,
+    root_of,
+    updated,
+)
+from makebreak.systems.contact_mpc.parameter_learner import (
+    ParameterLearner,
+    ParameterLearnerConfig,
+    ParameterStatus,
+)
+
+DOOR, LEG, BOX = bench.DOOR, bench.LEG, bench.BOX
+MORE = {  # Further parameters of the plants.
+    "door": [Parameter("com_y", 0.02, "door"), Parameter("mass", 0.5, "fore")],
+    "leg": [Parameter("damping", 0.5, "hip")] * 0,
+    "box": [Parameter("com_x", 0.005, "box"), Parameter("com_z", 0.005, "box")],
+}
+
+
+def model_of(task, more=()):
+    diagram, _ = diagram_of(task.world(task.values))
+    items = [*task.learned.values(), *more]
+    return AnitescuLcs(diagram, task.pairs(task.values), task.dt, parameters=items)
+
+
+def state_of(model, task, rng):
+    x = np.concatenate([task.q, rng.normal(size=model.n_v)])
+    x[: len(task.q)] += 0.02 * rng.normal(size=len(task.q))
+    for start, _ in model._dynamics.floating:
+        x[start : start + 4] /= np.linalg.norm(x[start : start + 4])
+    return x
+
+
+# How a step depends on the parameters.
+
+
+@pytest.mark.parametrize("task", [DOOR, LEG, BOX], ids=lambda t: t.name)
+def test_changes_of_a_step_agree_with_finite_differences(task):
+    """Also with forces, and away from the model's own values."""
+    model, rng = model_of(task, MORE[task.name]), np.random.default_rng(0)
+    p = model.parameters
+    values = p.nominal * 1.2 + 0.001
+    x, u = state_of(model, task, rng), rng.normal(size=model.n_u)
+    lam = np.abs(rng.normal(size=model.n_lam))
+    lcs = model.build(x, u, parameters=values)
+    dx, dw = model.step_changes(x, u, lcs, lam, values)
+    for i in range(len(p)):
+        ends = []
+        for side in (1.0, -1.0):
+            moved = values.copy()
+            moved[i] += side * 1e-5
+            of = model.build(x, u, parameters=moved)
+            x_next = of.A @ x + of.B @ u + of.D @ lam + of.d
+            ends.append((x_next, of.E @ x + of.H @ u + of.F @ lam + of.c))
+        by_x, by_w = ((a - b) / 2e-5 for a, b in zip(*ends, strict=True))
+        if p.is_dynamic[i]:
+            assert abs(by_x).max() > 0.0, p.names[i]
+            np.testing.assert_allclose(dx[:, i], by_x, atol=1e-6 * abs(by_x).max())
+            np.testing.assert_allclose(dw[:, i], by_w, atol=1e-6 * abs(by_w).max())
+        else:  # By differences of the learner's own.
+            assert not dx[:, i].any() and not dw[:, i].any()
+            assert abs(by_w).max() > 0.0, p.names[i]
+
+
+def test_values_of_parameters_are_those_of_a_plant_that_has_them():
+    """Bodies, joints and pairs; back at the model's values nothing is left of them."""
+    rng = np.random.default_rng(1)
+    true = {"mass": 3.1, "damping": 0.5, "friction": 0.7, "gap": 0.0}
+    given, plain = model_of(DOOR), AnitescuLcs(
+        diagram_of(DOOR.world(true))[0], DOOR.pairs(true), DOOR.dt
+    )  # fmt: skip
+    x, u = state_of(given, DOOR, rng), rng.normal(size=2)
+    before = given.build(x, u)
+    lcs, own = given.build(x, u, parameters=list(true.values())), plain.build(x, u)
+    for name in ("A", "B", "D", "d", "E", "F", "H", "c", "phi"):
+        np.testing.assert_allclose(
+            getattr(lcs, name), getattr(own, name), atol=1e-9, err_msg=name
+        )
+    np.testing.assert_array_equal(given.build(x, u).d, before.d)
+
+
+@pytest.mark.parametrize(
+    ("item", "said"),
+    [
+        (
+            Parameter("weight", 0.5, "door"),
+            "weight of door: unknown kind, expected",
+        ),
+        (Parameter("mass", 0.5, "gate"), r"no such body, expected one of \['world'"),
+        (Parameter("damping", 0.5, "hinge"), "no such joint, expected one of"),
+        (Parameter("friction", 0.5, pairs=[1]), "expected numbers of pairs, 0 to 0"),
+        (Parameter("gap", 0.01), "expected numbers of pairs"),
+        (Parameter("mass", 0.5, "door", [0]), r"pairs is \[0\], expected none"),
+        (Parameter("mass", 0.0, "door"), "std is 0.0, expected a positive number"),
+        (Parameter("mass", 0.5, "door", drift=-1.0), "drift is -1.0, expected 0 or"),
+    ],
+)
+def test_a_parameter_that_the_model_has_not_is_refused(item, said):
+    diagram, _ = diagram_of(DOOR.world(DOOR.values))
+    with pytest.raises(ValueError, match=said):
+        AnitescuLcs(diagram, DOOR.pairs(DOOR.values), parameters=[item])
+
+
+def test_a_parameter_that_comes_twice_is_refused():
+    diagram, _ = diagram_of(BOX.world(BOX.values))
+    items = [Parameter("friction", 0.5, pairs=p) for p in ([0, 1], [1, 2])]
+    with pytest.raises(ValueError, match="came twice"):
+        AnitescuLcs(diagram, BOX.pairs(BOX.values), parameters=items)
+
+
+def test_values_of_a_wrong_size_are_refused():
+    model = model_of(LEG)
+    with pytest.raises(ValueError, match=r"expected \(3,\), finite: \['mass of body'"):
+        model.build(model.x_default, np.zeros(2), parameters=[1.0])
+    plain = AnitescuLcs(diagram_of(LEG.world(LEG.values))[0], LEG.pairs(LEG.values))
+    with pytest.raises(ValueError, match="expected none: AnitescuLcs was made without"):
+        plain.build(plain.x_default, np.zeros(2), parameters=[1.0])
+
+
+# The belief.
+
+
+def sliding(mass, friction_force=0.0):
+    """A mass on a rail, far from a wall: x = [q, v]."""
+    dt = 0.1
+    B = np.array([[0.0], [dt / mass]])
+    D, E = np.array([[0.0], [-dt / mass]]), np.array([[-1.0 / dt, -1.0]])
+    F = np.array([[dt / mass + 1e-3]])
+    return LCS(
+        np.array([[1.0, dt], [0.0, 1.0]]), B, D, np.zeros(2), E, F, E @ B * 0.0,
+        np.array([1e3]), dt, np.array([1e2]), np.array([[0.0, -1.0]][0])[None, 1:],
+        np.array([0]),
+    )  # fmt: skip
+
+
+def test_without_contact_it_is_the_kalman_filter():
+    """A mass by its inverse z: v_next is linear in it, so the update is exact."""
+    loss = Loss(np.diag([0.0, 400.0]), 1.0, 1e-4, np.inf)
+    u, dt = np.array([2.0]), 0.1
+    belief, information, mean = prior(1), 1.0, 0.0
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        dv = 0.3 + 0.05 * rng.normal()
+        sample = Sample(np.zeros(2), u, np.array([0.0, dv]), np.zeros(1), np.eye(1))
+
+        def build(z):
+            return sliding(1.0 / (1.0 + z[0]))
+
+        def changes(z, lcs, lam):
+            return np.array([[0.0], [dt * u[0]]]), np.zeros((1, 1))
+
+        belief, found = updated(belief, sample, loss, 1.0, build, changes)
+        assert found is not None and found.lam[0] == 0.0
+        row = dt * u[0]
+        more = 400.0 * row**2
+        mean = (information * mean + 400.0 * row * (dv - row)) / (information + more)
+        information += more
+        assert belief.mean[0] == pytest.approx(mean, rel=1e-9)
+        assert belief.information[0, 0] == pytest.approx(information, rel=1e-9)
+
+
+@pytest.mark.parametrize("task", [DOOR, LEG], ids=lambda t: t.name)
+def test_the_gradient_of_the_loss_agrees_with_finite_differences(task):
+    """In contact, of dynamic parameters: the forces change along, and need no term."""
+    model, rng = model_of(task), np.random.default_rng(3)
+    p = model.parameters
+    x = state_of(model, task, rng)
+    u = rng.normal(size=model.n_u)
+    x_next = x + 0.01 * rng.normal(size=model.n_x)
+    sample = Sample(x, u, x_next, *model.between(x, x_next))
+    loss = Loss(np.diag([0.0] * 3 + [1e4] * 3), 0.5, 0.5 * model.eps_c, np.inf)
+    values = p.nominal.copy()
+    values[-1] = -0.9  # [m] so deep that there is force.
+
+    def loss_at(at):
+        return explain(model.build(sample.x, u, parameters=at), sample, loss)
+
+    found = loss_at(values)
+    assert found.lam.any()
+    dx, dw = model.step_changes(sample.x, u, found.lcs, found.lam, values)
+    gradient, information = gradient_and_information(found, sample, loss, dx, dw)
+    for i in np.flatnonzero(p.is_dynamic):
+        ends = []
+        for side in (1.0, -1.0):
+            moved = values.copy()
+            moved[i] += side * 1e-5
+            ends.append(loss_at(moved).loss)
+        assert gradient[i] == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-4)
+    assert np.linalg.eigvalsh(information)[0] > -1e-6 * np.trace(information)
+
+
+def test_only_what_is_certain_is_acted_on():
+    within = Belief(np.array([0.9, 0.0]), np.eye(2))
+    np.testing.assert_array_equal(certain_part(within), 0.0)
+    sure = Belief(np.array([2.0, 0.0]), np.diag([1e6, 1.0]))
+    np.testing.assert_allclose(certain_part(sure), [2.0, 0.0], atol=1e-5)
+    half = Belief(np.array([2.0, 0.0]), np.eye(2))
+    np.testing.assert_allclose(certain_part(half), [1.5, 0.0])
+    # Of two only the difference is known: neither is, and it is acted on.
+    d = np.array([1.0, -1.0]) / np.sqrt(2.0)
+    ratio = Belief(1.4 * d, np.eye(2) + 1e6 * np.outer(d, d))
+    assert (ratio.std > 0.7).all()
+    np.testing.assert_allclose(certain_part(ratio), 1.4 * d, atol=1e-5)
+
+
+def test_drift_forgets_but_never_below_the_model():
+    sure = Belief(np.array([1.0, 2.0]), np.diag([100.0, 100.0]))
+    later = drifted(sure, np.array([0.04, 0.0]))
+    np.testing.assert_allclose(later.std, [np.sqrt(0.05), 0.1])
+    np.testing.assert_allclose(drifted(sure, np.array([9.0, 9.0])).std, 1.0)
+
+
+def test_errors_in_parts_of_the_change_weigh_less_and_as_the_mass_matrix_says():
+    M = np.array([[2.0, 0.3], [0.3, 1.0]])
+    Q = np.array([0.0, 0.0, 1e4, 1e4])
+    lacks = np.array([0.0, 0.0, 0.5, -1.0])
+    W = error_weights(Q, 0.1, lacks, M)
+    size = 0.01 * lacks[2:] @ M @ lacks[2:] / 2.0
+    expected = np.linalg.inv(np.diag(1.0 / Q[2:]) + size * np.linalg.inv(M))
+    np.testing.assert_allclose(W[2:, 2:], expected, rtol=1e-9)
+    assert not W[:2].any()
+    np.testing.assert_allclose(root_of(W).T @ root_of(W), W, atol=1e-9 * W.max())
+    np.testing.assert_array_equal(error_weights(Q, 0.1, np.zeros(4), M), np.diag(Q))
+
+
+def test_scale_and_its_slopes():
+    scale = Scale(np.array([2.0, 0.1]), np.array([0.5, 0.01]), np.array([True, False]))
+    z = np.array([0.7, -1.0])
+    values = scale.values(z)
+    np.testing.assert_allclose(values, [2.0 * np.exp(0.35), 0.09])
+    slope = (scale.values(z + 1e-6) - scale.values(z - 1e-6)) / 2e-6
+    np.testing.assert_allclose(scale.slopes(values), slope, rtol=1e-6)
+
+
+# The system, beside worlds that are not the model's.
+
+
+@pytest.mark.parametrize(
+    "true",
+    [{"mass": 6.0}, {"mass": 1.5}, {"gap": 0.015}, {"gap": -0.012, "mass": 4.5}],
+    ids=str,
+)
+def test_a_leg_learns_its_mass_and_where_the_ground_is(true):
+    world = LEG.values | true
+    right = bench.run(LEG, world, knows=True, learns=False)
+    learned = bench.run(LEG, world, knows=False, learns=True)
+    mass, _, gap = learned.values
+    assert mass == pytest.approx(world["mass"], rel=0.05)
+    assert gap == pytest.approx(world["gap"], abs=1e-3)
+    assert (abs(learned.off) < 2.5).all()
+    assert learned.error < 1.2 * right.error + 2.0  # [mm]
+
+
+@pytest.mark.parametrize("task", [DOOR, LEG, BOX], ids=lambda t: t.name)
+def test_with_the_right_model_nothing_is_invented(task):
+    right = bench.run(task, task.values, knows=True, learns=False)
+    learned = bench.run(task, task.values, knows=False, learns=True)
+    assert (abs(learned.off) < 2.0).all()
+    assert learned.error < right.error + 1.0  # [mm], [mrad]
+
+
+def test_a_wrong_friction_is_no_gap_and_no_mass():
+    learned = bench.run(DOOR, DOOR.values | {"friction": 0.8}, False, True)
+    mass, damping, friction, gap = learned.values
+    assert friction == pytest.approx(0.8, rel=0.15)
+    assert mass == pytest.approx(2.0, rel=0.15) and abs(gap) < 1e-3
+
+
+class Switch(LeafSystem):
+    """enable: 0 in a part of the time."""
+
+    def __init__(self, off):
+        super().__init__()
+        self.off = off
+        self.DeclareVectorOutputPort("enable", 1, self.calc)
+
+    def calc(self, context, out):
+        low, high = self.off
+        out.set_value([0.0 if low <= context.get_time() < high else 1.0])
+
+
+def learner_beside(x, u, enable=None):
+    """A learner of the leg that reads constants; its simulator and itself."""
+    builder = DiagramBuilder()
+    diagram, _ = diagram_of(LEG.world(LEG.values))
+    config = ParameterLearnerConfig(LEG.pairs(LEG.values), list(LEG.learned.values()))
+    learner = builder.AddSystem(ParameterLearner(diagram, config, LEG.dt))
+    for name, value in (("x", x), ("u_measured", u)):
+        source = builder.AddSystem(ConstantVectorSource(np.array(value, dtype=float)))
+        builder.Connect(source.get_output_port(), learner.GetInputPort(name))
+    if enable is not None:
+        switch = builder.AddSystem(Switch(enable))
+        builder.Connect(switch.get_output_port(), learner.GetInputPort("enable"))
+    return Simulator(builder.Build()), learner
+
+
+X = [*LEG.q, 0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("x", "u", "enable", "status"),
+    [
+        (X, [np.nan, 0.0], None, ParameterStatus.NOT_FINITE),
+        ([np.nan, *X[1:]], [0.0, 0.0], None, ParameterStatus.NOT_FINITE),
+        (X, [0.0, 0.0], (0.0, 9.0), ParameterStatus.DISABLED),
+        ([1e200, *X[1:]], [0.0, 1e200], None, ParameterStatus.NOT_SOLVED),
+        (X, [0.0, 0.0], None, ParameterStatus.LEARNED),
+        (X, [0.0, 0.0], (0.09, 0.11), ParameterStatus.WAITING),
+    ],
+)
+def test_bad_samples_are_told_and_change_nothing(x, u, enable, status):
+    simulator, learner = learner_beside(x, u, enable)
+    simulator.AdvanceTo(0.13 if status == ParameterStatus.WAITING else 0.2)
+    context = learner.GetMyContextFromRoot(simulator.get_context())
+    assert learner.GetOutputPort("status").Eval(context)[0] == status
+    if status not in (ParameterStatus.LEARNED, ParameterStatus.WAITING):
+        nominal = learner.model.parameters.nominal
+        for name in ("parameters", "estimate"):
+            np.testing.assert_array_equal(
+                learner.GetOutputPort(name).Eval(context), nominal
+            )
+        np.testing.assert_array_equal(learner.GetOutputPort("std").Eval(context), 1.0)
+    rows = learner.learned(context)
+    assert [row.name for row in rows] == learner.model.parameters.names
+    assert all(row.low < row.learned < row.high for row in rows)
+
+
+def test_settings_out_of_range_are_refused():
+    diagram, _ = diagram_of(LEG.world(LEG.values))
+    good = ParameterLearnerConfig(LEG.pairs(LEG.values), list(LEG.learned.values()))
+    for change, said in (
+        ({"parameters": []}, "parameters is empty"),
+        ({"Q_d": [1.0]}, "Q_d is .*expected 6 numbers"),
+        ({"trust": 0.0}, "trust is 0.0, expected a positive number"),
+        ({"contact_std": -1.0}, "contact_std is -1.0, expected a positive number"),
+        ({"error_share": -0.1}, "error_share is -0.1, expected 0 or more"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            ParameterLearner(diagram, replace(good, **change), LEG.dt)
+
+
+def test_the_builder_plans_with_the_values_that_it_gets():
+    diagram, _ = diagram_of(LEG.world(LEG.values))
+    items = list(LEG.learned.values())
+    config = LcsBuilderConfig(LEG.pairs(LEG.values), LEG.dt, parameters=items)
+    builder = DiagramBuilder()
+    lcs = builder.AddSystem(AnitescuLcsBuilder(diagram, config))
+    values = np.array([5.0, 0.3, 0.01])
+    for name, value in (("x", X), ("u", [0.0, 0.0]), ("parameters", values)):
+        source = builder.AddSystem(ConstantVectorSource(np.array(value)))
+        builder.Connect(source.get_output_port(), lcs.GetInputPort(name))
+    simulator = Simulator(builder.Build())
+    simulator.AdvanceTo(0.05)
+    context = lcs.GetMyContextFromRoot(simulator.get_context())
+    got = lcs.GetOutputPort("lcs").Eval(context)
+    expected = model_of(LEG).build(X, np.zeros(2), parameters=values)
+    np.testing.assert_allclose(got.D, expected.D)
+    np.testing.assert_allclose(got.c, expected.c)
