@@ -86,6 +86,20 @@ def test_a_planner_that_learns_takes_a_wrong_puck_to_its_goal(tmp_path):
     assert numbers(tmp_path / "blind.py")[0] < 0.48
 
 
+def test_a_heavier_puck_is_weighed_while_it_is_pushed(tmp_path):
+    place, mass, low, high, damping, least, most, *gap = numbers(
+        "push_a_heavier_puck.py"
+    )
+    assert place == pytest.approx(0.5, abs=0.005)
+    assert mass == pytest.approx(1.5, rel=0.1) and low < 1.5 < high
+    assert damping == pytest.approx(5.0, rel=0.1) and least < 5.0 < most
+    assert abs(gap[1]) < 1e-3 and gap[2] < 0.0 < gap[3]
+    text = (EXAMPLES / "push_a_heavier_puck.py").read_text()
+    line = [each for each in text.splitlines() if '"parameters"))' in each]
+    (tmp_path / "blind.py").write_text(text.replace(line[0], ""))
+    assert numbers(tmp_path / "blind.py")[0] > 0.515
+
+
 def test_the_modes_are_told_apart_and_known_again():
     mode, found, rough, changed, again, back = numbers("detect_modes.py")
     assert [mode, rough, again] == [1, 2, 1]

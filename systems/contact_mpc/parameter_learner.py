@@ -62,7 +62,8 @@ class ParameterLearnerConfig:
     error_share: float = 0.1
     impact_share: float = 0.5  # The same of impacts, of which no law is exact.
     trust: float = 0.5  # Factor on the loss of a step: errors of steps are correlated.
-    slip_noise: float = 0.0  # Of the measured sliding speed [m/s], see opening_speed.
+    # Noise of the measured sliding speed [m/s]: a slower one is taken for none.
+    slip_noise: float = 0.02
     closest: int | None = None  # As of AnitescuLcs.
 
 

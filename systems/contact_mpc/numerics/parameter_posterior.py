@@ -164,8 +164,8 @@ def root_of(W) -> np.ndarray:
 
 
 def impact_part(lcs: LCS, sample: Sample, lacks) -> float:
-    """Part, 0 to 1, of the energy of the change `lacks` (n_x,) that is of contacts whose
-    bodies meet or part in the step: nothing while they move together."""
+    """Part, 0 to 1, of the energy of the change `lacks` (n_x,) that is of contacts
+    whose bodies meet or part in the step: nothing while they move together."""
     n_v = sample.v_mean.size
     dv, energy = (sample.x_next - sample.x_now)[-n_v:], 0.0
     for contact in np.unique(lcs.contact):
