@@ -195,10 +195,10 @@ def run(task: Task, true: dict, knows: bool, learns: bool) -> Run:
     plant.Finalize()
     pairs, n_u = task.pairs(own), plant.num_actuated_dofs()
     items = list(task.learned.values()) if learns else []
-    limit = [task.u_max] * n_u
+    limit = np.full(n_u, task.u_max)
     config = ContactMpcConfig(
         pairs, list(task.Q), list(task.R), list(task.x_desired), task.dt, task.dt,
-        C3Options(N=task.N, rounds=5, polish=3), C3Bounds([-u for u in limit], limit),
+        C3Options(N=task.N, rounds=5, polish=3), C3Bounds(-limit, limit),
         parameters=items,
     )  # fmt: skip
     mpc = builder.AddSystem(make_contact_mpc(model, config))
@@ -258,7 +258,7 @@ def row(task: Task, seeds: Sequence[int]) -> dict:
         )
         errors.append([without.error, learned.error, right.error])
         offs.append(learned.off)
-    off = np.abs(offs)
+    off = np.abs(np.array(offs, dtype=float))
     without, learned, right = np.median(errors, axis=0)
     return {
         "what": f"{task.name}, {len(seeds)} wrong models: error with the learner",

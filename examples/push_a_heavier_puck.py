@@ -8,14 +8,13 @@ from pydrake.systems.framework import DiagramBuilder
 import makebreak as mb
 
 text = open(mb.model_path("puck.sdf")).read()
-heavier = text.replace("<mass>0.5", "<mass>1.5")
-builders = []
-for time_step, sdf in ((0.0, text), (0.001, heavier)):  # The model, and the world.
+builders = []  # The model's, and the world's.
+for time_step, sdf in ((0.0, text), (0.001, text.replace("<mass>0.5", "<mass>1.5"))):
     builders.append(world := DiagramBuilder())
     plant, _ = AddMultibodyPlantSceneGraph(world, time_step)
     Parser(plant).AddModelsFromString(sdf, "sdf")
     plant.Finalize()
-model, pairs = builders[0].Build(), [mb.ContactPair("finger", "puck", 0.3)]
+pairs = [mb.ContactPair("finger", "puck", 0.3)]
 parameters = [  # What may be wrong, and how far: a mass by a factor of 1.6 or so.
     mb.Parameter("mass", 0.5, "puck"),
     mb.Parameter("damping", 0.5, "puck_rail"),
@@ -24,7 +23,7 @@ parameters = [  # What may be wrong, and how far: a mass by a factor of 1.6 or s
 Q, x_desired = [0, 200, 1, 20], [0.4, 0.5, 0, 0]  # As in push_a_puck.py.
 config = mb.ContactMpcConfig(pairs, Q, [0.01], x_desired, period_sec=0.05)
 config.parameters = parameters  # The plan is for the values that are learned.
-mpc = world.AddSystem(mb.make_contact_mpc(model, config))
+mpc = world.AddSystem(mb.make_contact_mpc(model := builders[0].Build(), config))
 config = mb.ParameterLearnerConfig(pairs, parameters)
 learner = world.AddSystem(mb.ParameterLearner(model, config, 0.05, offset_sec=5e-5))
 for system in (mpc, learner):

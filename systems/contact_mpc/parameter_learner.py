@@ -26,6 +26,7 @@ from makebreak.systems.contact_mpc.numerics.parameter_posterior import (
     explain,
     impact_part,
     prior,
+    pushes,
     step_of,
     updated,
 )
@@ -266,7 +267,7 @@ class ParameterLearner(LeafSystem):
         if found is not None and found.lam.any():
             values = self._scale.values(belief.mean)
             before, after = (
-                model.build(x, sample.u, parameters=values).J
+                pushes(model.build(x, sample.u, parameters=values))[0]
                 for x in (sample.x_now, sample.x_next)
             )
             impulse = model.dt_sec * (after - before).T @ found.lam

@@ -202,7 +202,7 @@ class AnitescuLcs:
         dv = -dt * np.linalg.solve(plant.CalcMassMatrix(context), torque)
         N, _ = self._dynamics.velocity_maps(x[:n_q])
         dx[n_q:], dx[:n_q] = dv, dt * (N @ dv)
-        return dx, lcs.J @ dv
+        return dx, np.asarray(lcs.J) @ dv
 
     def _build_analytic(self, model: ConstantMassModel, x, u, mu) -> LCS:
         contacts, chosen = self._contacts, None

@@ -54,7 +54,8 @@ class ModelParameters:
     def __init__(self, items, plant: MultibodyPlant, context: Context, pair_friction):
         self.items, self._plant = tuple(items), plant
         self.names = [f"{p.kind} of {_of(p)}" for p in self.items]
-        values, known = [], set()
+        values = []
+        known: set[tuple] = set()
         for p, name in zip(self.items, self.names, strict=True):
             _check(p, name, len(pair_friction))
             of = {(p.kind, each) for each in p.pairs or [p.of]}

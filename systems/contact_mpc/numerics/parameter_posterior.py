@@ -133,7 +133,7 @@ def step_of(lcs: LCS, sample: Sample, loss: Loss):
     lacks -= sample.x_next - sample.x_now
     # A contact that pushes is closed at one end of the step at least: its row has the
     # smaller of the gaps there, instead of one that the end's velocity extrapolates.
-    w = lcs.E @ x + lcs.H @ sample.u + lcs.c - lcs.J @ (sample.v_mean - v_now)
+    w = lcs.E @ x + lcs.H @ sample.u + lcs.c - pushes(lcs)[0] @ (sample.v_mean - v_now)
     w -= 0.5 * abs(normal_speed(lcs, sample.v_mean)) + normal_speed(lcs, v_next)
     return lacks, w + opening_speed(lcs, sample.x_next, loss.slip_noise)
 
@@ -168,10 +168,8 @@ def impact_part(lcs: LCS, sample: Sample, lacks) -> float:
     whose bodies meet or part in the step: nothing while they move together."""
     n_v = sample.v_mean.size
     dv, energy = (sample.x_next - sample.x_now)[-n_v:], 0.0
-    for contact in np.unique(lcs.contact):
-        of = (lcs.contact == contact) & np.isfinite(lcs.phi)
-        if of.any():
-            normal = lcs.J[of].mean(axis=0)
+    for normal, _ in normals(lcs):
+        if normal.any():
             mobility = normal @ np.linalg.solve(sample.M, normal)
             if mobility > 0.0:
                 energy = max(energy, (normal @ dv) ** 2 / mobility)
@@ -181,12 +179,26 @@ def impact_part(lcs: LCS, sample: Sample, lacks) -> float:
 
 def normal_speed(lcs: LCS, v) -> np.ndarray:
     """(n_lam,) rate of each row's gap [m/s]; zero where w holds no gap."""
-    along, rate = lcs.J @ v, np.zeros(lcs.n_lam)
-    for contact in np.unique(lcs.contact):
-        of = (lcs.contact == contact) & np.isfinite(lcs.phi)
-        if of.any():
-            rate[of] = along[of].mean()  # The edges come in opposite pairs.
+    rate = np.zeros(lcs.n_lam)
+    for normal, rows in normals(lcs):
+        rate[rows] = normal @ v
     return rate
+
+
+def pushes(lcs: LCS) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """J, phi and contact of an LCS that has them. Raises: ValueError."""
+    if lcs.J is None or lcs.phi is None or lcs.contact is None:
+        raise ValueError("the LCS does not say what its forces push along")
+    return lcs.J, lcs.phi, lcs.contact
+
+
+def normals(lcs: LCS):
+    """(n_v,) what each contact's normal force pushes along, and its rows (n_lam,)."""
+    J, phi, contact = pushes(lcs)
+    for number in np.unique(contact):
+        rows = (contact == number) & np.isfinite(phi)
+        if rows.any():
+            yield J[rows].mean(axis=0), rows  # The edges come in opposite pairs.
 
 
 def explain(lcs: LCS, sample: Sample, loss: Loss) -> Explained | None:
