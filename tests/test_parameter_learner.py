@@ -27,8 +27,10 @@ from makebreak.systems.contact_mpc.numerics.parameter_posterior import (
     error_weights,
     explain,
     gradient_and_information,
+    impact_part,
     prior,
     root_of,
+    step_of,
     updated,
 )
 from makebreak.systems.contact_mpc.parameter_learner import (
@@ -187,6 +189,29 @@ def test_without_contact_it_is_the_kalman_filter():
         assert belief.information[0, 0] == pytest.approx(information, rel=1e-9)
 
 
+def test_a_damping_takes_what_was_moved_whatever_the_speed_was_meanwhile():
+    """m dv = -d dq exactly; as where an impact is in the step."""
+    dt, damping, moved = 0.1, 0.7, 0.02
+    x_now = np.array([0.0, 1.0])
+    x_next = np.array([moved, 1.0 - damping * moved])
+    lcs = sliding(1.0)
+    A = lcs.A.copy()
+    A[1, 1] -= dt * damping
+    lcs = replace(lcs, A=A)
+    sample = Sample(x_now, np.zeros(1), x_next, np.array([moved / dt]), np.eye(1))
+    lacks, _ = step_of(lcs, sample, Loss(np.eye(2), 1.0, 1e-4, np.inf))
+    assert abs(lacks[1]) < 1e-12
+
+
+def test_an_impact_is_where_bodies_meet_and_not_where_they_move_together():
+    lcs, M = sliding(1.0), np.eye(1)
+    for dv, part in ((np.array([-0.5]), 1.0), (np.zeros(1), 0.0)):
+        x_next = np.array([0.0, 0.5 + dv[0]])
+        sample = Sample(np.array([0.0, 0.5]), np.zeros(1), x_next, dv, M)
+        lacks = np.array([0.0, 0.5])  # A force has changed the speed by so much.
+        assert impact_part(lcs, sample, lacks) == pytest.approx(part)
+
+
 @pytest.mark.parametrize("task", [DOOR, LEG], ids=lambda t: t.name)
 def test_the_gradient_of_the_loss_agrees_with_finite_differences(task):
     """In contact, of dynamic parameters: the forces change along, and need no term."""
@@ -285,6 +310,13 @@ def test_with_the_right_model_nothing_is_invented(task):
     learned = bench.run(task, task.values, knows=False, learns=True)
     assert (abs(learned.off) < 2.0).all()
     assert learned.error < right.error + 1.0  # [mm], [mrad]
+
+
+def test_an_impact_beyond_the_friction_cone_is_no_friction():
+    """Drake's default solver lets friction exceed it where the arm meets the door."""
+    learned = bench.run(DOOR, DOOR.values | {"damping": 1.2}, False, True)
+    assert learned.values[2] == pytest.approx(0.4, rel=0.4)
+    assert learned.values[1] == pytest.approx(1.2, rel=0.1)
 
 
 def test_a_wrong_friction_is_no_gap_and_no_mass():
