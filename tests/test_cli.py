@@ -565,10 +565,13 @@ def test_bench_diagrams_gives_the_real_time_factor_of_each_setting(monkeypatch):
 
     monkeypatch.setattr(trials, "_COMMAND", spring_mass.COMMAND)
     monkeypatch.setattr(bench_diagrams, "EXPERIMENTS", experiments.EXPERIMENTS)
-    [row] = bench_diagrams.rows()
+    monkeypatch.setattr(bench_diagrams, "ALONE_SEC", 0.2)
+    alone, row = bench_diagrams.rows()
     assert row["what"] == "spring_mass, soft" and row["value"] > 0
+    assert alone["plants"] == 1.0
+    assert row["plants"] == alone["value"] / row["value"] < 1.0  # One mass, no arm.
     monkeypatch.setattr(spring_mass, "BENCH", {"hard": {"spring.stiffness": -1.0}})
-    [row] = bench_diagrams.rows()
+    _, row = bench_diagrams.rows()
     assert row["what"] == "spring_mass, hard" and row["value"] is None
     assert "exit status 2: makebreak: spring.stiffness: got -1.0" in row["note"]
     assert row["met"] is False
