@@ -72,6 +72,8 @@ class Facts:
     whether agreement needs simulated windows. turned: that another direction of gravity
     explains as much, as a sentence. unjudged: what was measured and not compared, as a
     sentence. found_before: whether an effect was taken off the recordings beforehand.
+    below: held-out error with effects, too, that move simulated windows less than the
+    scene's own time step does.
     """
 
     choices: Sequence[Choice]
@@ -86,6 +88,7 @@ class Facts:
     turned: str = ""
     unjudged: str = ""
     found_before: bool = False
+    below: float = float("inf")
 
 
 def _before(gap: GapMeasure | None) -> float:
@@ -122,8 +125,8 @@ def _said(text: str) -> Callable[[Facts], str]:
 # (condition, verdict, sentence): the first that holds decides.
 Row = tuple[Callable[[Facts], bool], str, Callable[[Facts], str]]
 WITHOUT_EFFECTS: Sequence[Row] = (
-    (lambda f: not f.start <= max(AGREEMENT_RMS_MAX, NOISE_RMS_MAX) or f.far,
-     "gap_unnamed", _said("")),
+    (lambda f: f.far or not (f.start <= max(AGREEMENT_RMS_MAX, NOISE_RMS_MAX)
+                             or f.below <= UNEXPLAINED_RMS), "gap_unnamed", _said("")),
     # Among many others one that is off would not show.
     (lambda f: f.loud[1] > max(f.loud_max, UNEXPLAINED_RMS), "gap_unnamed",
      lambda f: f" {f.loud[0]} is off by {figure(f.loud[1], 2)} times its noise."),
@@ -143,8 +146,8 @@ WITHOUT_EFFECTS: Sequence[Row] = (
 )  # fmt: skip
 WITH_EFFECTS: Sequence[Row] = (
     (lambda f: f.far or _left_in_simulation(f), "gap_unnamed", _said("")),
-    (lambda f: leaves_gap(f.start, f.end) and not _closed_in_simulation(f),
-     "gap_unnamed", _said("")),
+    (lambda f: leaves_gap(f.start, min(f.end, f.below))
+     and not _closed_in_simulation(f), "gap_unnamed", _said("")),
     (lambda f: bool(f.turned), "ambiguous", lambda f: f.turned),
     (lambda f: any(c.ties or c.sets for c in f.choices), "ambiguous", _said("")),
     (lambda f: True, "gap_named", _said("")),

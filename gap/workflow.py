@@ -24,7 +24,7 @@ from makebreak.gap.by_recording import (
     may_differ,
     with_differences,
 )
-from makebreak.gap.confirm import Veto, confirmed, judge_of
+from makebreak.gap.confirm import confirmed, judge_of
 from makebreak.gap.data import sampled_commands
 from makebreak.gap.data.channel_noise import in_newton_metres
 from makebreak.gap.data.check_drives import (
@@ -84,6 +84,7 @@ from makebreak.gap.result import (
 )
 from makebreak.gap.search.choice import Choice, Selection
 from makebreak.gap.search.chosen_by_simulation import (
+    above_step,
     kept_by_simulation,
     preferred_by_simulation,
 )
@@ -505,6 +506,10 @@ def conclude(
     selection, chosen_on = kept_by_simulation(problem, selection, jobs)
     selection, chosen_on = preferred_by_simulation(problem, selection, chosen_on, jobs)
     selection, chosen_on = softer_by_simulation(problem, selection, chosen_on, jobs)
+    step = max((c.size for c in checks if c.kind == "time_step"), default=0.0)
+    selection, chosen_on, vetoed, below = above_step(
+        problem, selection, chosen_on, step, jobs
+    )
     scattered = scatter(problem, selection.end)
     choices = [
         _with_inseparable(_widened(c, problem, selection.end, scattered), problem)
@@ -517,12 +522,12 @@ def conclude(
     def facts_of(some: Selection, outcome: Outcome | None) -> Facts:
         return Facts(
             some.choices, problem.error(some.start), problem.error(some.end), some.far,
-            outcome.gap if outcome else None, loud=problem.loudest(some.start),
+            outcome.gap if outcome else None, below=below,
+            loud=("", 0.0) if np.isfinite(below) else problem.loudest(some.start),
             loud_max=problem.plan.loud, asks_simulation=problem.plan.simulation_agrees,
         )  # fmt: skip
 
     judge = judge_of(problem, reported, jobs)
-    vetoed: list[Veto] = []
     outcome: Outcome | None = None
     while True:
         facts = facts_of(selection, chosen_on)

@@ -13,6 +13,7 @@ from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Outcome
 from makebreak.gap.result import GapMeasure, InUnits
 from makebreak.gap.search.choice import Choice, Selection
+from makebreak.gap.search.chosen_by_simulation import above_step
 from makebreak.gap.verdict import Facts, decide, too_weak
 from makebreak.models.effects.kind import Effect
 
@@ -189,3 +190,41 @@ def test_half_of_the_gap_must_be_closed_in_simulation_and_in_equations(
     facts = Facts((choice,), 11.0, 8.0, far=True, chosen_on=shown)
     assert decide(facts)[0] == "gap_unnamed"
     assert too_weak(facts, in_equations) == why
+
+
+@pytest.mark.parametrize(
+    ("step", "kept"),
+    [
+        (0.0, JOINTS),  # A continuous plant errs by nothing.
+        # Windows of three joints: sqrt((1.2^2 - 1) / 3) = 0.38 for the second one, and
+        # 0.29 for the third; without the first one they are 1.9 times off.
+        (0.2, JOINTS),
+        (0.35, JOINTS[:2]),
+        (5.0, JOINTS[:1]),
+    ],
+)
+def test_what_moves_windows_less_than_the_scenes_step_is_not_named(step, kept):
+    problem = Held({"arm.j1": (3.0, 1.0), "arm.j2": (1.2, 1.0), "arm.j3": (1.12, 1.0)})
+    selection = selection_of(problem)
+    outcome = problem.outcome(selection.effects(), None, None, None)
+    left, after, small, below = above_step(problem, selection, outcome, step, 1)
+    assert tuple(c.effect.at[0] for c in left.choices) == kept
+    assert [c.effect.at[0] for c, _ in small] == [*reversed(JOINTS[len(kept) :])]
+    assert all("time step" in why for _, why in small)
+    if small:
+        assert below == pytest.approx(problem.error(selection.end))
+        assert below < problem.error(left.end)
+        shown = problem.outcome(left.effects(), None, None, None).gap
+        assert after is not None and after.gap.after == pytest.approx(shown.after)
+    else:
+        assert below == np.inf
+
+
+def test_what_the_scenes_step_errs_by_is_no_gap():
+    """Where windows agree, equations may show the world's own step, and no more."""
+    agrees = GapMeasure(0.9, 0.9, 1.0, 0.3)
+    facts = Facts((), 2.4, 2.4, chosen_on=agrees)
+    assert decide(facts)[0] == "gap_unnamed"
+    assert decide(replace(facts, below=1.2))[0] == "no_gap"
+    assert decide(replace(facts, below=2.2))[0] == "gap_unnamed"
+    assert decide(replace(facts, below=1.2, far=True))[0] == "gap_unnamed"

@@ -17,6 +17,7 @@ from makebreak.gap.thresholds import (
     SIMULATED_RIVAL_RATIO,
     SIMULATED_RIVALS_MAX,
 )
+from makebreak.gap.verdict import figure
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 
@@ -45,6 +46,42 @@ def kept_by_simulation(
         if other is not None and other.gap.after <= outcome.gap.after:
             selection, outcome = fewer, other
     return selection, outcome
+
+
+def above_step(
+    problem: GapProblem,
+    selection: Selection,
+    outcome: Outcome | None,
+    step: float,
+    jobs: int,
+) -> tuple[Selection, Outcome | None, list[tuple[Choice, str]], float]:
+    """The selection without effects that move simulated windows, which agree without
+    them, less than the scene's own time step does: the world may have such a step, too,
+    or none. And what it comes to; those effects, and why; the held-out error with them.
+
+    Args: step: what the scene's time step errs by, in windows' expected errors.
+    """
+    small: list[tuple[Choice, str]] = []
+    below = problem.error(selection.end)
+    for choice in reversed(selection.choices) if step > 0.0 else ():
+        if outcome is None or not outcome.gap.is_measured:
+            break
+        fewer = without(problem, selection, choice.effect)
+        other = problem.outcome(
+            fewer.effects(), fewer.start, fewer.end, fewer.nuisances, jobs=jobs
+        )
+        if other is None or not other.gap.is_measured:
+            break
+        moved = abs(other.gap.after**2 - outcome.gap.after**2) ** 0.5
+        if other.gap.after <= AGREEMENT_RMS_MAX and moved <= step:
+            why = (
+                f"It moves simulated windows by {figure(moved, 2)} times the expected "
+                f"error, no more than the scene's time step errs by "
+                f"({figure(step, 2)})."
+            )
+            small.append((choice, why))
+            selection, outcome = fewer, other
+    return selection, outcome, small, below if small else float("inf")
 
 
 def preferred_by_simulation(
