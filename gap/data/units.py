@@ -27,6 +27,7 @@ _NEAR = 0.03
 # What a reading pays: for a rate, a jump, a limit or a name that it contradicts; for a
 # position that counts from elsewhere; for another unit of time.
 _RATE, _JUMP, _BEYOND, _NAME, _OFFSET, _TIME = 5.0, 3.0, 4.0, 3.0, 1.0, 4.0
+_UNLIKE = 0.1  # Of a velocity that is not in its position's unit per second.
 _OF_ITS_OWN = 2.0  # A joint pays so much less by another reading than the others'.
 _LARGE = 20.0  # [rad] Of a joint without limits.
 _ROOM = 0.1  # Of a joint's range, beyond it.
@@ -222,6 +223,7 @@ class _Columns:
                 is_named = name_v is not None and v.factor == name_v.factor
                 cost = q.cost + beyond + (0.0 if is_named else v.cost)
                 cost += 0.0 if is_named or name_v is None else _NAME
+                cost += 0.0 if v is own else _UNLIKE
                 off, sign = 0.0, 1.0
                 if self.ratio is not None:
                     sign = float(np.sign(self.ratio))

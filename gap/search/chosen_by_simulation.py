@@ -17,7 +17,6 @@ from makebreak.gap.thresholds import (
     SIMULATED_RIVAL_RATIO,
     SIMULATED_RIVALS_MAX,
 )
-from makebreak.gap.verdict import figure
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 
@@ -75,9 +74,9 @@ def above_step(
         moved = abs(other.gap.after**2 - outcome.gap.after**2) ** 0.5
         if other.gap.after <= AGREEMENT_RMS_MAX and moved <= step:
             why = (
-                f"It moves simulated windows by {figure(moved, 2)} times the expected "
+                f"It moves simulated windows by {moved:.2g} times the expected "
                 f"error, no more than the scene's time step errs by "
-                f"({figure(step, 2)})."
+                f"({step:.2g})."
             )
             small.append((choice, why))
             selection, outcome = fewer, other
