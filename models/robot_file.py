@@ -144,7 +144,7 @@ def _of_document(document: Any, path: Path, suffix: str, packages) -> RobotFile:
     make_mesh_paths_absolute(document, path.parent)
     notes = _cleaned_mimics(document) + _unused(document)
     if suffix == ".urdf":
-        notes += _cleaned_transmissions(document)
+        notes += _cleaned_transmissions(document) + _without_commas(document)
         _clean_materials(document)
     effects, more = _of_joints(document)
     return RobotFile(
@@ -340,6 +340,17 @@ def _cleaned_transmissions(document: minidom.Document) -> list[str]:
                 notes.append(f"a transmission drives {name}, which is no joint")
                 _remove(transmission)
     return notes
+
+
+def _without_commas(document: minidom.Document) -> list[str]:
+    """Numbers of a vector are parted by blanks; ROS reads those with commas, too."""
+    n = 0
+    for element in document.getElementsByTagName("*"):
+        for key in ("xyz", "rpy", "size", "scale"):
+            if "," in (value := element.getAttribute(key)):
+                element.setAttribute(key, value.replace(",", " "))
+                n += 1
+    return [f"{n} vectors have commas, which are read as blanks"] if n else []
 
 
 def _clean_materials(document: minidom.Document) -> None:

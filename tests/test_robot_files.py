@@ -311,6 +311,17 @@ def test_rounding_is_no_fault():
         assert fault_of(Inertial(1.0, np.zeros(3), np.diag(moments))) == ""
 
 
+def test_vectors_with_commas_are_those_with_blanks(tmp_path):
+    path = arm(tmp_path)
+    plain = read_robot(path).plant
+    path = tmp_path / "commas.urdf"
+    path.write_text((tmp_path / "arm.urdf").read_text().replace("0 0 -0.4", "0, 0 -.4"))
+    own = read_robot(path)
+    assert any("commas" in note for note in own.file.notes)
+    mass = [p.CalcMassMatrix(p.CreateDefaultContext()) for p in (plain, own.plant)]
+    np.testing.assert_allclose(mass[1], mass[0], rtol=1e-12)
+
+
 PACKAGE = Path(trimesh.__file__).parents[1] / (
     "cmeel.prefix/share/example-robot-data/robots"
 )

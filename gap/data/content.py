@@ -51,7 +51,10 @@ GAINS = (0.45, 1.6)
 # Shares of an effort that is the weight's, to tell by; of the weight that one without
 # it may still have.
 WEIGHS, LEFT_OUT = 0.1, 0.2
-FEW, MOST_ORDERED = 100, 6  # Instants, joints, that all orders are tried of.
+FEW = 100  # Instants at which many readings are tried.
+# Joints of which all orders are tried, those of which swaps are, and those that may be
+# off where one has another zero.
+ALL_ORDERS, MOST_ORDERED, MOST_OFF = 6, 8, 8
 ROOM = 0.1  # Of a joint's range, beyond it.
 NO_WEIGHT = 0.02  # Of what an effort without weight leaves at most.
 # Of one joint alone, what it carries may make its effort so many times larger; what
@@ -577,7 +580,9 @@ def _all_ordered(contents: Contents, matches, said) -> list[Match]:
     """All of the joints' columns in another order, as arrays without names have them
     where a driver sorts its joints: that in which the model explains all efforts."""
     efforts, n = _columns_of(contents, matches, _DRIVES), len(contents.joints)
-    before = _misfit(contents, efforts) if len(efforts) == n else -np.inf
+    if len(efforts) < n or n > MOST_ORDERED:
+        return matches
+    before = _misfit(contents, efforts)
     if before < np.log(1.0 - EXPLAINS):
         return matches
     few = contents.fewer(FEW)
@@ -589,7 +594,7 @@ def _all_ordered(contents: Contents, matches, said) -> list[Match]:
         return _misfit(few, {i: efforts[k] for i, k in enumerate(order)})
 
     order = tuple(range(n))
-    if n <= MOST_ORDERED:
+    if n <= ALL_ORDERS:
         order = min(permutations(range(n)), key=left)
     else:  # By swaps of two.
         least = np.inf
@@ -617,6 +622,10 @@ def _from_their_zeros(contents: Contents, matches, said) -> list[Match]:
     efforts = _columns_of(contents, matches, _DRIVES)
     before = _misfit(contents, efforts) if efforts else -np.inf
     if before < np.log(TOLD_WELL):
+        return matches
+    each = {i: contents.of_effort(name, i) for i, name in efforts.items()}
+    off = [i for i, x in each.items() if x is None or x.explained < EXPLAINS]
+    if len(off) > MOST_OFF:
         return matches
     few, found = contents.fewer(FEW), {}
     mine = _columns_of(contents, matches, ("position",))
