@@ -861,6 +861,68 @@ def bad_cells(text: str) -> str:
     return "\n".join([head, *rows]) + "\n"
 
 
+# ----- A fourth time.
+
+
+def one_factor(what, factor, *words):
+    """One joint's column alone, in another unit."""
+
+    def wrong(log: Log):
+        load = np.std([log.columns[n] for n in names(log, "effort")], axis=1)
+        i = int(np.argmax(load * ~np.array(log.slides)))
+        name = f"joint{i + 1}_{what}"
+        log.columns[name] = log.columns[name] / factor
+        return words if not all(log.slides) else ("",)
+
+    return wrong
+
+
+def timedeltas(log: Log):
+    """As pandas writes the time since a start."""
+    text = [f"0 days 00:00:{t:09.6f}" for t in log.time]
+    log.columns = {"time": log.time} | log.columns
+    log.write = lambda folder, columns: csv_of(folder / "log.csv", columns, text=text)
+    return ("",)
+
+
+def half_turn(log: Log):
+    load = np.std(log.weight, axis=0) * ~np.array(log.slides)
+    i = int(np.argmax(load))
+    log.columns[f"joint{i + 1}_position"] += np.pi
+    log.truth.pop(f"arm.joint{i + 1}.position")  # A turn is none.
+    return ("180 deg",) if load[i] > 0.0 else ("",)
+
+
+def newest_first(log: Log):
+    log.columns = {"time": log.time} | log.columns
+    log.columns = {name: y[::-1] for name, y in log.columns.items()}
+    return ("order of their stamps", "newest")
+
+
+def in_cm(log: Log):
+    for i in range(log.joints):
+        if log.slides[i]:
+            log.columns[f"joint{i + 1}_position"] *= 100.0
+    return ("cm",) if any(log.slides) else ("",)
+
+
+def per_cent(log: Log):
+    """Of a rating of each motor."""
+    ratings = log.rng.uniform(5.0, 40.0, log.joints)
+    for name, rating in zip(names(log, "effort"), ratings, strict=True):
+        log.columns[name] = 100.0 * log.columns[name] / rating
+    return ("larger than the model needs",)
+
+
+def goals_late(log: Log):
+    """Goals beside efforts, which are not what drives the joints here."""
+    for i in range(log.joints):
+        q = log.truth[f"arm.joint{i + 1}.position"]
+        goal = np.interp(log.time + 0.1, log.time, q)
+        log.columns[f"joint{i + 1}_goal_position"] = goal
+    return ("effort_measured is taken",)
+
+
 KINDS = {
     "effort in N mm": scaled("effort", 1e-3, "N mm"),
     "effort in N cm": scaled("effort", 1e-2, "N cm"),
@@ -998,7 +1060,25 @@ KINDS = {
     "topics on rows of their own": rows_of_their_own,
     "a status beside": with_status,
 }  # fmt: skip
-UNSEEN = list(KINDS)[list(KINDS).index("a tilted base") :]
+KINDS |= {
+    # A fourth time.
+    "one velocity in degrees": one_factor("velocity", np.pi / 180.0, "deg/s"),
+    "one effort in N mm": one_factor("effort", 1e-3, "N mm"),
+    "times since a start": timedeltas,
+    "one position off by 180 degrees": half_turn,
+    "the newest row first": newest_first,
+    "slides in cm": in_cm,
+    "efforts in per cent": per_cent,
+    "time in hours": stamps(lambda log: log.time / 3600.0, "3600 s"),
+    "quoted cells": as_text(
+        lambda text: "".join(
+            ",".join(f'"{x}"' for x in row.split(",")) + "\n"
+            for row in text.splitlines()
+        ), ""
+    ),
+    "goals beside efforts": goals_late,
+}  # fmt: skip
+UNSEEN = list(KINDS)[list(KINDS).index("one velocity in degrees") :]
 
 
 @dataclass(frozen=True)

@@ -756,7 +756,9 @@ def _factors(
            if not GAINS[0] < x.factor < GAINS[1]}  # fmt: skip
     if not odd:
         return {}
-    if not alike:  # Loads and springs make some efforts larger, or smaller.
+    # Loads and springs make some efforts larger, or smaller, but not all of them.
+    whole = len(known) == len(found) > 1 and len(odd) == len(known)
+    if not alike and not whole:
         odd = {i: f for i, f in odd.items()
                if f < 0.0 or not 1.0 / LARGE < f < LARGER}  # fmt: skip
     if alike:  # Of joints that do not tell, as of those that do.

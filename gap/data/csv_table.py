@@ -30,9 +30,10 @@ _STAMP = re.compile(
 )
 
 
-# A time of day alone.
+# A time of day alone, or since a start.
 _CLOCK = re.compile(
-    rb"(?<![\w:.-])([0-2]?\d):([0-5]\d):([0-5]\d)(?:[.,](\d+))?(?![\w:])"
+    rb"(?<![\w:.-])(?:(\d+) days?,? )?([0-2]?\d):([0-5]\d):([0-5]\d)"
+    rb"(?:[.,](\d+))?(?![\w:])"
 )
 
 
@@ -261,8 +262,9 @@ def _in_seconds(text: bytes) -> bytes:
         return b"%d.%s" % (int(at.timestamp()), fraction or b"0")
 
     def of_day(found: re.Match[bytes]) -> bytes:
-        hours, minutes, rest, fraction = found.groups()
-        whole = 3600 * int(hours) + 60 * int(minutes) + int(rest)
+        days, hours, minutes, rest, fraction = found.groups()
+        whole = 86400 * int(days or 0) + 3600 * int(hours) + 60 * int(minutes)
+        whole += int(rest)
         return b"%d.%s" % (whole, fraction or b"0")
 
     return _CLOCK.sub(of_day, _STAMP.sub(seconds, text))

@@ -8,7 +8,7 @@ import numpy as np
 
 from makebreak.gap.data.csv_table import BadRows, text_columns
 from makebreak.gap.data.proposal import find_time
-from makebreak.gap.data.stamps import is_part_of, mended, whole_stamp
+from makebreak.gap.data.stamps import is_backward, is_part_of, mended, whole_stamp
 from makebreak.gap.data.table import MOST_CELLS, RecordingTable, is_text, read_table
 
 
@@ -47,6 +47,13 @@ def read_joined(
             says = f"{file.name}: time is {stamp[0]}, of its seconds and nanoseconds"
             notes = (*table.notes, ("stamps_of_two_columns", says))
             table = replace(table, columns=columns, notes=notes)
+        found = find_time(table.columns)
+        if found is not None and is_backward(table.columns[found.column]):
+            says = f"{file.name}: the newest row comes first; they are turned round"
+            table = replace(
+                table, columns={k: y[::-1] for k, y in table.columns.items()},
+                row=table.row[::-1], notes=(*table.notes, ("stamps_back", says)),
+            )  # fmt: skip
         tables.append((file, table))
     if len(tables) == 1:
         return tables[0][1], text

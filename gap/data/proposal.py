@@ -14,6 +14,7 @@ from makebreak.gap.data.arrays import TIME_WORDS, words_of
 from makebreak.gap.data.bags import MotorRange
 from makebreak.gap.data.csv_table import is_nameless
 from makebreak.gap.data.match import AS_SAID, JointName, Match, plain_name
+from makebreak.gap.data.stamps import is_backward
 from makebreak.gap.data.table import COMMANDS, is_channel
 from makebreak.gap.data.units import in_units, quantity_of_unit, unit_in_name
 
@@ -386,6 +387,7 @@ def find_time(columns: Mapping[str, np.ndarray]) -> Match | None:
         ):
             continue
         step = np.diff(value[np.isfinite(value)])
+        step = -step if is_backward(value) else step
         if len(step) < 5 or not np.mean(step >= 0.0) > 0.9:
             continue
         typical = float(np.median(step[step > 0.0])) if (step > 0.0).any() else 0.0

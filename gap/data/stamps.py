@@ -83,6 +83,12 @@ def mended(
     return columns, row, notes
 
 
+def is_backward(t: np.ndarray) -> bool:
+    """Whether the newest row comes first."""
+    step = np.diff(t[np.isfinite(t)])
+    return len(step) > _AROUND and float(np.mean(step < 0.0)) > 0.9
+
+
 def whole_stamp(columns: Mapping[str, np.ndarray]) -> tuple[str, np.ndarray] | None:
     """(name, (n,) [s]) of stamps that two columns have the seconds and the nanoseconds
     of, as ROS messages do."""

@@ -260,6 +260,9 @@ class _Columns:
         for offset in (zero, zero - TURN, zero + TURN, -turn):
             if offset and fits(offset):
                 return offset, _OFFSET
+        quarters = () if j.prismatic else (-0.5, -0.25, 0.25, 0.5)
+        if any(fits(TURN * k) for k in quarters):  # Content tells whether it is so.
+            return 0.0, 1.5 * _OFFSET
         beyond = max(abs(low), abs(high)) / max(abs(j.lower), abs(j.upper), 1e-9)
         return 0.0, 0.7 if beyond < (1.3 if unit.cost else 2.0) else _BEYOND
 
