@@ -83,6 +83,8 @@ def read_robot_file(path: Path, packages: PackageMap, bare: bool = False) -> Rob
 @lru_cache(maxsize=64)
 def _read(path: Path, changed: int, packages: tuple, surroundings: tuple) -> RobotFile:
     source = path.read_text(errors="replace")
+    # A declaration stands first; other readers do not mind where it is.
+    source = re.sub(r"<\?xml[^>]*\?>", "", source)
     if path.suffix.lower() == ".xacro" or _uses_xacro(source):
         source = _expanded(path, dict(packages))
     try:
@@ -145,6 +147,7 @@ def _of_document(document: Any, path: Path, suffix: str, packages) -> RobotFile:
     notes = _cleaned_mimics(document) + _unused(document)
     if suffix == ".urdf":
         notes += _cleaned_transmissions(document) + _without_commas(document)
+        notes += _without_empty_limits(document)
         _clean_materials(document)
     effects, more = _of_joints(document)
     return RobotFile(
@@ -186,7 +189,8 @@ def _without_collisions(file: RobotFile) -> str:
 
 
 def _uses_xacro(source: str) -> bool:
-    return "<xacro:" in re.sub(r"<!--.*?-->", "", source, flags=re.S)
+    plain = re.sub(r"<!--.*?-->", "", source, flags=re.S)
+    return "<xacro:" in plain or re.search(r"\$\((optenv|env|arg)\b", plain) is not None
 
 
 def _expanded(path: Path, packages: Mapping[str, str]) -> str:
@@ -339,6 +343,31 @@ def _cleaned_transmissions(document: minidom.Document) -> list[str]:
             if (name := joint.getAttribute("name")) not in joints:
                 notes.append(f"a transmission drives {name}, which is no joint")
                 _remove(transmission)
+    names = set[str]()
+    for actuator in document.getElementsByTagName("actuator"):
+        name = actuator.getAttribute("name")
+        if name in names:  # As after copying a block; nothing asks for it.
+            actuator.setAttribute("name", f"{name}_{len(names)}")
+        names.add(actuator.getAttribute("name"))
+    return notes
+
+
+def _without_empty_limits(document: minidom.Document) -> list[str]:
+    """Of joints whose lower limit is above the upper: simulators take that for none."""
+    notes = []
+    for limit in document.getElementsByTagName("limit"):
+        try:
+            low, high = (float(limit.getAttribute(k)) for k in ("lower", "upper"))
+        except ValueError:
+            continue
+        if low > high:
+            joint: Any = limit.parentNode
+            for key in ("lower", "upper"):
+                limit.removeAttribute(key)
+            notes.append(
+                f"joint {joint.getAttribute('name')} has a lower limit of {low:g} and "
+                f"an upper one of {high:g}: it is taken to have none"
+            )
     return notes
 
 

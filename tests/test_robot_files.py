@@ -322,6 +322,29 @@ def test_vectors_with_commas_are_those_with_blanks(tmp_path):
     np.testing.assert_allclose(mass[1], mass[0], rtol=1e-12)
 
 
+def test_what_other_readers_do_not_mind_is_read(tmp_path):
+    """A declaration below a blank line, limits the wrong way round, one name of two
+    actuators, and a variable of the environment."""
+    drive = """<transmission name="{0}"><type>transmission_interface/SimpleTransmission
+    </type><joint name="{0}"/><actuator name="motor"/></transmission>"""
+    path = arm(tmp_path)
+    text = path.read_text().replace('lower="-3" upper="3"', 'lower="1" upper="-1"', 1)
+    text = (
+        text.replace("</robot>", drive.format("j1") + drive.format("j2")) + "</robot>"
+    )
+    path.write_text("\n<!-- An arm -->\n<?xml version='1.0'?>\n" + text)
+    own = read_robot(path)
+    assert own.plant.num_actuators() == 2
+    assert np.isinf(own.joints[0].lower) and own.joints[1].lower == -3.0
+    assert any("taken to have none" in note for note in own.file.notes)
+    path = tmp_path / "variables.urdf"
+    text = text.replace('mass value="1.0"', 'mass value="$(optenv ARM_MASS 1.5)"', 1)
+    path.write_text(text)
+    own = read_robot(path)
+    masses = [own.plant.GetBodyByName(n).default_mass() for n in ("l1", "l2")]
+    assert masses == [1.5, 1.0]
+
+
 PACKAGE = Path(trimesh.__file__).parents[1] / (
     "cmeel.prefix/share/example-robot-data/robots"
 )
