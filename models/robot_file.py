@@ -96,8 +96,12 @@ def _read(path: Path, changed: int, packages: tuple, surroundings: tuple) -> Rob
     assert root is not None  # Of a document that could be read.
     if root.tagName == "mujoco":
         plain = plain_mjcf(path)
+        named = re.sub(
+            r'(<mujoco[^>]*\bmodel=")([^"]*)',
+            lambda m: m[1] + plain_word(m[2]), plain.text, count=1,
+        )  # fmt: skip
         return RobotFile(
-            path, plain.text, ".xml", plain.effects, plain.drives, plain.home,
+            path, named, ".xml", plain.effects, plain.drives, plain.home,
             plain.gravity, plain.notes, left_out=plain.left_out,
         )  # fmt: skip
     suffix = {"robot": ".urdf", "sdf": ".sdf"}.get(root.tagName)
@@ -112,11 +116,17 @@ def _read(path: Path, changed: int, packages: tuple, surroundings: tuple) -> Rob
     return _of_document(document, path, suffix, given)
 
 
+def plain_word(name: str) -> str:
+    """A model's name as places of effects can have it, where a dot parts words."""
+    return re.sub(r"\W", "_", name)
+
+
 def _of_document(document: Any, path: Path, suffix: str, packages) -> RobotFile:
     if suffix == ".urdf" and not children(document.documentElement, "link"):
         raise ValueError(f"{path} has no <link>, so it describes no robot")
-    if suffix == ".urdf" and not document.documentElement.getAttribute("name"):
-        document.documentElement.setAttribute("name", path.name.split(".")[0])
+    if suffix == ".urdf":
+        name = document.documentElement.getAttribute("name") or path.name.split(".")[0]
+        document.documentElement.setAttribute("name", plain_word(name))
     lost: dict[str, Path | None] = {}
     lost_visuals: dict[str, Path | None] = {}
     visuals = collisions = 0

@@ -345,6 +345,27 @@ def test_what_other_readers_do_not_mind_is_read(tmp_path):
     assert masses == [1.5, 1.0]
 
 
+def test_a_models_name_may_have_dots_and_brackets(tmp_path):
+    """Its friction and its rotor are effects at `<model>.<joint>`."""
+    path = arm(tmp_path, first=FRICTION)
+    path.write_text(
+        path.read_text().replace('robot name="arm"', 'robot name="a-1(v2.0)"')
+    )
+    assert [e.kind for e in read_robot(path).file.effects] == ["joint_coulomb_friction"]
+    mjcf = tmp_path / "arm.xml"
+    mjcf.write_text(
+        '<mujoco model="a-1(v2.0)"><worldbody><body name="l1"><joint name="j1" axis='
+        '"0 1 0" armature="0.3"/><inertial pos="0 0 -.1" mass="1" '
+        'diaginertia=".1 .1 .1"'
+        "/></body></worldbody></mujoco>"
+    )
+    own = read_robot(mjcf)
+    assert own.model == "a_1_v2_0_" and own.joints[0].name == "a_1_v2_0_.j1"
+    plant = own.plant
+    mass = plant.CalcMassMatrix(plant.CreateDefaultContext())[0, 0]
+    assert mass == pytest.approx(0.1 + 0.01 + 0.3)
+
+
 PACKAGE = Path(trimesh.__file__).parents[1] / (
     "cmeel.prefix/share/example-robot-data/robots"
 )
