@@ -59,7 +59,10 @@ def mended(
                 central = nearest_physical(inertial.central, 0.0)
                 write_inertial(links[name], replace(inertial, central=central))
                 continue
-            body = plant.GetBodyByName(name, instance)
+            is_world = name == "world"  # Drake has one, of no model.
+            body = (
+                plant.world_body() if is_world else plant.GetBodyByName(name, instance)
+            )
             group = plant.GetBodiesWeldedTo(body)
             empty = replace(inertial, mass=max(inertial.mass, 0.0),
                             central=np.zeros((3, 3)))  # fmt: skip

@@ -366,6 +366,20 @@ def test_a_models_name_may_have_dots_and_brackets(tmp_path):
     assert mass == pytest.approx(0.1 + 0.01 + 0.3)
 
 
+def test_a_link_called_world_is_the_world(tmp_path):
+    """As ROS has it, here with a bad inertia that nobody needs."""
+    path = robot(
+        tmp_path, link("world", m=0.0), link("l1"), joint("j1", "world", "l1"),
+        link("l2"), joint("j2", "l1", "l2"),
+    )  # fmt: skip
+    path.write_text(path.read_text().replace('<link name="base"/>', ""))
+    own = read_robot(path)
+    assert own.bases == () and len(own.joints) == 2
+    (tmp_path / "scene.yaml").write_text(proposal_of(tmp_path, path).scene)
+    loaded = load_scene(tmp_path / "scene.yaml", DiagramBuilder())
+    assert loaded.plant.num_positions() == 2
+
+
 PACKAGE = Path(trimesh.__file__).parents[1] / (
     "cmeel.prefix/share/example-robot-data/robots"
 )
