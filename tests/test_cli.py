@@ -458,6 +458,8 @@ def test_reproduce_prints_and_writes_its_table_and_fails_on_a_missed_row(capsys)
     assert [row["ours"] for row in table["rows"]] == [1, 0]
     assert [row["met"] for row in table["rows"]] == [True, False]
     assert "| comes to rest | 1 | 1 |" in Path("out/reproduce.md").read_text()
+    assert "<td>comes to rest</td>" in Path("out/report.html").read_text()
+    assert not list(Path("out").glob("*/*/report.html"))  # Of single trials.
 
 
 def test_reproduce_keeps_earlier_trials_when_told_so(capsys):
@@ -486,6 +488,8 @@ def test_meshcat_is_announced_and_stays_until_enter_at_a_terminal(capsys, monkey
     assert "Meshcat stays open; press Enter to leave" in shown
     assert terminal.read() == "more\n"  # One line was waited for.
     assert "<html" in Path("out/meshcat.html").read_text()[:200].lower()
+    page = Path("out/report.html").read_text()
+    assert "Goals met" in page and "meshcat.html#small" in page
     monkeypatch.setattr("sys.stdin", io.StringIO("more"))  # No terminal: ends at once.
     assert cli.main(["run", "spring_mass", "--out", "out"]) == 0
     assert "press Enter" not in capsys.readouterr().out

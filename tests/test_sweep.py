@@ -101,6 +101,8 @@ def test_a_sweep_writes_table_rows_and_plots(capsys):
     assert [case["success"]["of"] for case in summary["cases"]] == [3, 3]
     # What was not measured: "-" in the table, null or an empty cell in the files.
     assert "nan" not in shown + Path("out/sweep.md").read_text()
+    page = Path("out/report.html").read_text()
+    assert page.count("data:image/png") == len(list(Path("out").glob("*.png"))) > 0
     assert {row["touched_s"] for row in rows} == {""}
     assert json.loads(rows[0]["bounces_error_m"]) == [0.5, None]
     assert Path("out/noise.png").read_bytes()[:4] == b"\x89PNG"

@@ -131,6 +131,7 @@ def _reproduce_in(session, modules, seeds: int, jobs: int, args, seed) -> int:
     """The tables of all modules; seed: of benchmarks, or None. Returns: the exit
     status."""
     from makebreak.scripts.experiments.papers.hypotheses import verdicts
+    from makebreak.scripts.runner.result_page import result_page
 
     tables = {}
 
@@ -144,6 +145,8 @@ def _reproduce_in(session, modules, seeds: int, jobs: int, args, seed) -> int:
         session.write_text(
             "reproduce.md", "\n".join(t.to_markdown() for t in tables.values())
         )
+        page = result_page("makebreak reproduce", list(tables.values()))
+        session.write_text("report.html", page)
 
     for name, module in modules.items():
         if hasattr(module, "reproduce"):

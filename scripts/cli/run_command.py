@@ -100,6 +100,8 @@ def run_in(session, args, experiment, config, duration) -> int:
         result |= session.limits_kept()
         result |= {"interrupted": session.interrupted, "ended": session.endings}
         session.write_result(result)
+        if not args.is_trial:
+            session.report = partial(_page, session, args.experiment, result)
     files = session.finish(not session.interrupted and session.unwritten is None)
     _print_outcome(session, args.experiment, result, files)
     check_written(session)
@@ -160,14 +162,31 @@ def _failed(session, error: BaseException) -> int:
     return fault(error, kept[0] if kept else None)
 
 
+def _page(session, name: str, result: dict, pictures, is_moving: bool) -> str:
+    """The text of report.html."""
+    from makebreak.scripts.runner.result_page import result_page
+
+    says = [*session.endings, *session.too_slow(), *(result.get("criteria") or [])]
+    return result_page(
+        f"makebreak run {name}", [_table(name, result)], result["success"], says,
+        pictures, is_moving, session.compared_by,
+    )  # fmt: skip
+
+
+def _table(name: str, result: dict):
+    """The result, a row a value."""
+    from makebreak.scripts.runner.table import Table
+
+    rows = [(k, v) for k, v in result.items() if k not in ("criteria", "ended")]
+    return Table(name, ("result", "value"), rows)
+
+
 def _print_outcome(session, name: str, result: dict | None, files) -> None:
     """The table of the result, why the run ended, and which files were written."""
     from makebreak.scripts.runner.criteria import success_text
-    from makebreak.scripts.runner.table import Table
 
     if result is not None:
-        rows = [(k, v) for k, v in result.items() if k not in ("criteria", "ended")]
-        show(Table(name, ("result", "value"), rows))
+        show(_table(name, result))
         lines = [*session.endings, *session.too_slow(), success_text(result)]
         print("\n".join(lines), flush=True)
     print_files(files)

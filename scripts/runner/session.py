@@ -127,6 +127,8 @@ class Session:
         self._streams: list[Path] = []  # Recordings that are written while it runs.
         self._watched: list[np.ndarray] = []  # Output of each simulation's monitor.
         self.compared_by = ""  # The command that compares recording and model.
+        # Of plots by name, and whether there is an animation: the text of report.html.
+        self.report: Callable[[Mapping[str, bytes], bool], str] | None = None
 
     def child(self, name: str) -> "Session":
         """A session for one of several trials, in the subfolder `name`."""
@@ -438,8 +440,9 @@ class Session:
         return True
 
     def finish(self, complete: bool = True) -> list[Path]:
-        """Writes timing.json, the plots and, where there is a Meshcat, meshcat.html,
-        and moves all files to the session's folder.
+        """Writes timing.json, the plots, where there is a Meshcat meshcat.html, and
+        report.html if there is something to tell, and moves all files to the session's
+        folder.
 
         Args: complete: False keeps an older, complete result that is in the folder.
         Returns: all files of the run.
@@ -455,6 +458,11 @@ class Session:
                 if self.meshcat is not None:
                     self.meshcat.DeleteAddedControls()  # A page cannot answer them.
                     self.write_text("meshcat.html", page_of(self.meshcat))
+                if self.report is not None:
+                    plots = [(n, self.outputs.file(n)) for _, n in self._figures]
+                    shown = {n: p.read_bytes() for n, p in plots if p.is_file()}
+                    moving = self.meshcat is not None
+                    self.write_text("report.html", self.report(shown, moving))
             finally:  # A plot that fails does not lose the result.
                 files = self.outputs.commit(complete)
             return files

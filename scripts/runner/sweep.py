@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from scipy.stats import binomtest
 
 from makebreak.scripts.runner.outputs import OutputFolder
+from makebreak.scripts.runner.result_page import result_page
 from makebreak.scripts.runner.settings import (
     apply_settings,
     convert,
@@ -199,9 +200,15 @@ def _run(sweep: Sweep, outputs: OutputFolder, jobs, cluster, command):
     files[0].write_text(table.to_markdown())
     files[1].write_text(json.dumps(_summary(sweep, groups, measured), indent=2) + "\n")
     _write_csv(files[2], runs, results, [*sweep.cases_of, *sweep.ranges])
+    pictures: dict[str, bytes] = {}
     for key in [*sweep.ranges, *sweep.cases_of]:
         path = outputs.file(f"{key.replace('.', '_')}.png")
         _plot(sweep, key, runs, results, measured).savefig(path, dpi=120)
+        pictures[path.name] = path.read_bytes()
+    page = result_page(
+        f"makebreak sweep {sweep.experiment}", [table], None, (), pictures
+    )
+    outputs.file("report.html").write_text(page)
     return table, outputs.commit()
 
 

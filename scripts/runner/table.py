@@ -50,7 +50,7 @@ class Table:
         """Number of rows that miss their target."""
         return sum(1 for met in self.met if met is not None and not met)
 
-    def _cells(self) -> tuple[list[str], list[list[str]]]:
+    def cells(self) -> tuple[list[str], list[list[str]]]:
         """Headings and rows as text; with a last column for the targets, if any."""
         heads = [str(c) for c in self.columns]
         rows = [[format_cell(value) for value in row] for row in self.rows]
@@ -62,7 +62,7 @@ class Table:
 
     def to_text(self) -> str:
         """The table in aligned columns, numbers to the right, under its title."""
-        heads, rows = self._cells()
+        heads, rows = self.cells()
         widths = [max(map(len, col)) for col in zip(heads, *rows, strict=True)]
         right = [
             bool(self.rows) and all(_is_number(row[j]) for row in self.rows)
@@ -82,14 +82,14 @@ class Table:
 
     def transposed(self) -> "Table":
         """Columns as rows: for few rows of many columns in a terminal."""
-        heads, rows = self._cells()
+        heads, rows = self.cells()
         names = [heads[0], *(row[0] for row in rows)]
         turned = list(zip(heads[1:], *(row[1:] for row in rows), strict=True))
         return Table(self.title, names, turned, notes=self.notes)
 
     def to_markdown(self) -> str:
         """The table as a Markdown section."""
-        heads, rows = self._cells()
+        heads, rows = self.cells()
 
         def line(cells):
             return "| " + " | ".join(c.replace("|", "\\|") for c in cells) + " |"

@@ -1,0 +1,30 @@
+"""report.html of a run, a sweep or a reproduction."""
+
+import re
+
+from makebreak.scripts.runner.result_page import result_page
+from makebreak.scripts.runner.table import Table
+
+
+def test_what_was_missed_comes_first_and_text_is_no_html():
+    rows = [("<b>x</b>", float("nan")), ("y", 0.25)]
+    table = Table("spring_mass", ("result", "value"), rows, [None, False], ["a note"])
+    says = ["met     rests: yes", "MISSED  error: 3 < 2"]
+    page = result_page("makebreak run spring_mass", [table], False, says)
+    assert "Goals missed" in page and "<iframe" not in page
+    assert '<li class="error">MISSED  error: 3 &lt; 2</li>' in page
+    assert "<li>met     rests: yes</li>" in page
+    cells = re.findall(r"<td>(.*?)</td>", page)
+    assert cells == ["&lt;b&gt;x&lt;/b&gt;", "-", "", "y", "0.25", "MISSED"]
+    assert "a note" in page and "<pre>" not in page
+
+
+def test_plots_and_the_animation_are_in_it_and_long_tables_are_folded():
+    table = Table("t", ("n",), [(k,) for k in range(30)])
+    page = result_page(
+        "t", [table], True, pictures={"a.png": b"png"}, is_moving=True, command="go"
+    )
+    assert "Goals met" in page and 'alt="a.png" src="data:image/png;base64,' in page
+    assert 'src="meshcat.html#small"' in page and "<pre>go</pre>" in page
+    shown, _, folded = page.partition("<details>")
+    assert "18 more" in folded and ">11<" in shown and ">12<" in folded
