@@ -84,7 +84,8 @@ def test_every_command_has_json_and_quiet():
 def test_a_run_writes_its_files_and_a_table(capsys):
     assert run("--seed", "3", "--duration", "10") == 0
     written = {path.name for path in Path("out").iterdir()} - {"running"}
-    names = "config.yaml result.json timing.json recording.csv noise.json position.png"
+    names = "config.yaml result.json timing.json recording.csv noise.json position.png "
+    names += "report.html"
     assert written == {*names.split(), ".makebreak.json"}
     shown = capsys.readouterr()
     for name in names.split():

@@ -34,7 +34,7 @@ WHOLE = {
 }
 PARTS = {
     "command_line.md": 1, "effects.md": 3, "impedance.md": 1, "install.md": 1,
-    "recordings.md": 1, "scenes.md": 1, "station.md": 1,
+    "parameter_learning.md": 1, "recordings.md": 1, "scenes.md": 1, "station.md": 1,
 }  # fmt: skip
 
 
@@ -112,6 +112,11 @@ def test_an_own_arm_gets_an_impedance():
         builder=DiagramBuilder(), control_plant=make_control_plant(),
     )  # fmt: skip
     assert names["arm"].HasOutputPort("tau")
+
+
+def test_what_may_be_wrong_in_a_model_is_named():
+    named = ran("parameter_learning.md", 0)["parameters"]
+    assert [each.kind for each in named] == ["mass", "damping", "friction", "gap"]
 
 
 def test_recordings_are_read_and_checked(tmp_path, monkeypatch, capsys):
