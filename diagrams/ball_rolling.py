@@ -331,7 +331,7 @@ def add_ball_rolling(
 
     for i in range(station.num_input_ports()):
         port = station.get_input_port(i)
-        if port.get_name() != f"{ARM}.torque_commanded":
+        if port.get_name() not in (f"{ARM}.torque_commanded", "overhead.region"):
             builder.ExportInput(port, port.get_name())
 
     _add_records(builder, station, impedance, estimator)
@@ -441,6 +441,10 @@ def _add_sensing(
         builder.Connect(
             station.GetOutputPort("overhead.rgb_image"), tracker.GetInputPort("image")
         )
+        if station.HasInputPort("overhead.region"):
+            builder.Connect(
+                tracker.GetOutputPort("region"), station.GetInputPort("overhead.region")
+            )
     estimator = builder.AddNamedSystem(
         "state_estimator",
         StateEstimator(

@@ -9,9 +9,6 @@ import cv2
 import numpy as np
 from pydrake.geometry import (
     ClippingRange,
-    ColorRenderCamera,
-    DepthRange,
-    DepthRenderCamera,
     LightParameter,
     MakeRenderEngineVtk,
     RenderCameraCore,
@@ -21,11 +18,12 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder, OutputPort
-from pydrake.systems.sensors import CameraInfo, RgbdSensor
+from pydrake.systems.sensors import CameraInfo
 
 from makebreak.systems.perception.camera_shake import CameraShake
 from makebreak.systems.perception.numerics.pinhole import Pinhole, look_down
 from makebreak.systems.perception.pinhole_camera import PinholeCamera
+from makebreak.systems.perception.region_camera import RegionCamera
 
 # Drake's VTK images are shifted by half a pixel towards -u and -v against their
 # CameraInfo (tests/test_camera.py measures it); the drawn images have the same shift.
@@ -176,14 +174,9 @@ def _add_vtk(builder, scene_graph, config, camera, name):
         ClippingRange(0.01, 10.0),
         RigidTransform(),
     )
-    sensor = RgbdSensor(
-        scene_graph.world_frame_id(),
-        RigidTransform(RotationMatrix(camera.R_WC), camera.p_WC),
-        ColorRenderCamera(core, False),
-        DepthRenderCamera(core, DepthRange(0.01, 10.0)),
+    X_WC = RigidTransform(RotationMatrix(camera.R_WC), camera.p_WC)
+    sensor = builder.AddNamedSystem(
+        f"{name}_camera", RegionCamera(scene_graph.world_frame_id(), X_WC, core)
     )
-    builder.AddNamedSystem(f"{name}_camera", sensor)
-    builder.Connect(
-        scene_graph.get_query_output_port(), sensor.query_object_input_port()
-    )
-    return sensor.color_image_output_port()
+    builder.Connect(scene_graph.get_query_output_port(), sensor.GetInputPort("query"))
+    return sensor.GetOutputPort("rgb_image")

@@ -105,7 +105,8 @@ def make_station(
     """The plant, its sensors and actuators.
 
     Inputs:  panda.torque_commanded (7,) [N m]: of the motors, clipped to the effort
-             limits.
+             limits; overhead.region (3,), optional, of a camera that renders with VTK
+             (RegionCamera).
     Outputs of sensors, with noise:
              panda.position_measured (7,) [rad], panda.velocity_measured (7,) [rad/s],
              panda.torque_measured (7,) [N m]: of the motors, after the limits;
@@ -167,6 +168,10 @@ def make_station(
             image = faulty_image(
                 builder, image, config.camera, loaded, wrong.ball, config.seed, faults
             )
+        elif builder.HasSubsystemNamed("overhead_camera"):
+            camera = builder.GetSubsystemByName("overhead_camera")
+            if camera.HasInputPort("region"):  # Faults may delay images.
+                builder.ExportInput(camera.GetInputPort("region"), "overhead.region")
         builder.ExportOutput(image, "overhead.rgb_image")
     if faults:
         _add_monitor(builder, plant, limit)

@@ -345,6 +345,28 @@ class Rig:
         return value if len(value) > 1 else value[0]
 
 
+def test_what_is_outside_its_region_changes_nothing():
+    """So a camera need not render it."""
+    whole, part = Rig(), Rig()
+    assert np.isnan(whole.region).all()  # Everywhere, as nothing was seen.
+    for k in range(40):
+        picture = sketch(np.array([0.55 + 0.002 * k, -0.1 + 0.003 * k, RADIUS]))
+        masked = picture.copy()
+        if np.isfinite(part.region).all():
+            u, v, half = part.region
+            rows, columns = np.indices(picture.shape[:2])
+            masked[(abs(rows - v) > half + 2) | (abs(columns - u) > half + 2)] = 0
+        whole.show(picture)
+        part.show(masked)
+        assert part.status == TRACKED
+        np.testing.assert_array_equal(part.p_WB, whole.p_WB)
+        np.testing.assert_array_equal(part.v_WB, whole.v_WB)
+    assert np.isfinite(part.region).all() and part.region[2] < 60.0
+    for _ in range(3):
+        part.show(sketch())  # It is gone.
+    assert np.isnan(part.region).all()
+
+
 def test_before_the_first_picture_nothing_is_seen_and_all_is_finite():
     rig = Rig()
     assert rig.seen == 0.0 and rig.status == NOT_FOUND

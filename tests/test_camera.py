@@ -303,3 +303,35 @@ def test_a_camera_that_cannot_be_is_refused_by_name(change, message):
 def test_a_pinhole_of_wrong_shape_is_refused_by_name():
     with pytest.raises(ValueError, match=r"Pinhole.p_WC is \(2,\), expected \(3,\)"):
         Pinhole(320, 240, 300.0, np.zeros(2), np.zeros(2), np.eye(3))
+
+
+@pytest.mark.skipif(not vtk_works(), reason="Drake cannot render here: no GL libraries")
+def test_a_region_has_the_pixels_of_the_whole_image_and_nothing_beyond():
+    studio = Studio(CameraConfig(renderer="vtk"), [(Sphere(RADIUS), ORANGE)])
+    camera = studio.diagram.GetSubsystemByName("overhead_camera")
+    region = camera.GetInputPort("region")
+    own = camera.GetMyMutableContextFromRoot(studio.context)
+    ball = np.array([0.45, 0.12, RADIUS])
+    whole = studio.picture(ball)
+    pinhole = camera_model(CameraConfig(renderer="vtk"))
+    u, v = pinhole.project(pinhole.to_camera(ball)[None])[0]
+    for center in ((u, v), (160.0, 120.0), (3.0, 237.0), (400.0, -50.0)):
+        region.FixValue(own, [*center, 30.0])  # Also at a corner, and beyond.
+        part = studio.picture(ball)
+        seen = part[:, :, 3] > 0
+        rows, columns = np.flatnonzero(seen.any(1)), np.flatnonzero(seen.any(0))
+        assert seen.sum() == rows.size * columns.size < 0.4 * seen.size
+        difference = abs(part[seen].astype(int) - whole[seen])
+        assert difference.mean() < 0.05 and np.mean(difference > 2) < 0.005
+        asked = np.ix_(
+            np.arange(max(int(center[1]) - 30, 0), min(int(center[1]) + 30, 240)),
+            np.arange(max(int(center[0]) - 30, 0), min(int(center[0]) + 30, 320)),
+        )
+        assert seen[asked].all()
+        if center == (u, v):
+            np.testing.assert_allclose(
+                orange_centroid(part), orange_centroid(whole), atol=0.01
+            )
+    for nothing in ([np.nan] * 3, [u, v, 200.0]):
+        region.FixValue(own, nothing)
+        np.testing.assert_array_equal(studio.picture(ball), whole)

@@ -15,6 +15,7 @@ from makebreak.systems.numerics.timing import timed
 from makebreak.systems.perception.numerics import constant_velocity, interacting_models
 from makebreak.systems.perception.numerics.ball_tracker import (
     find_ball,
+    search_half_px,
     strength_weights,
 )
 from makebreak.systems.perception.numerics.pinhole import Pinhole
@@ -67,7 +68,9 @@ class BallTracker(LeafSystem):
              lies lower, and so at another point of the ray on which it is seen.
     Outputs: p_WB (3,) [m]; v_WB (3,) [m/s]; seen (1,): 1 if the last image showed the
              ball at a plausible place, else 0; status (1,): TRACKED, NOT_FOUND, OUTLIER
-             or WRONG_IMAGE; position_std (1,) [m]: of x and y of p_WB.
+             or WRONG_IMAGE; position_std (1,) [m]: of x and y of p_WB; region (3,) of
+             the next image that is looked at: centre and half its side [px], not a
+             number: all of it.
 
     While the ball is not seen, p_WB is held, v_WB is held for HOLD_SEC and then zero,
     and position_std grows. Before the ball is seen for the first time p_WB is the point
@@ -128,6 +131,7 @@ class BallTracker(LeafSystem):
             ("seen", 1, self._seen),
             ("status", 1, self._status),
             ("position_std", 1, self._position_std),
+            ("region", 3, self._region),
         ):
             self.DeclareVectorOutputPort(name, size, calc, prerequisites_of_calc=ticket)
         self.DeclarePeriodicDiscreteUpdateEvent(
@@ -232,6 +236,19 @@ class BallTracker(LeafSystem):
 
     def _position_std(self, context, output):
         output.SetAtIndex(0, np.sqrt(self._get(context)[_COVARIANCE][0]))
+
+    def _region(self, context, output):
+        state, c = self._get(context), self._config
+        p_next, _, _ = interacting_models.combined(
+            *self._predict(_unflat(state[_MODELS:]))
+        )
+        p_C = self._camera.to_camera([*p_next, c.table_z + c.ball_radius])
+        if state[_STATUS] != TRACKED or not p_C[2] > 0.0:
+            output.SetFromVector(np.full(3, np.nan))
+            return
+        center = self._camera.project(p_C[None])[0]
+        half = search_half_px(self._camera.focal * c.ball_radius / p_C[2])
+        output.SetFromVector([*center, half])
 
 
 def _flat(estimate):

@@ -72,7 +72,7 @@ def find_ball(image, camera: Pinhole, hue_weights, radius, table_z, guess_p=None
         depth = p_C[2]
         if depth > radius:
             radius_px = camera.focal * radius / depth
-            low, high = _window(camera, p_C, (LARGEST + 0.2) * radius_px + 6.0)
+            low, high = _window(camera, p_C, search_half_px(radius_px))
     if not depth > radius or (high - low < 8).any():
         return None
     radius_px = camera.focal * radius / depth
@@ -101,6 +101,11 @@ def find_ball(image, camera: Pinhole, hue_weights, radius, table_z, guess_p=None
     if not SMALLEST < seen_radius / radius < LARGEST:
         return None
     return Detection(p_WB, seen_radius, n_kept / N_RAYS)
+
+
+def search_half_px(radius_px: float) -> float:
+    """Half the side of the square that is searched about a guess [px]."""
+    return (LARGEST + 0.2) * radius_px + 6.0
 
 
 def _window(camera, p_C, half_px):
