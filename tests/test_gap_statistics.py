@@ -419,6 +419,9 @@ class Steps:
     plan = SearchPlan(jumps=True)
     dynamics = SimpleNamespace(least=lambda kind, at: {}, now=lambda kind, at: {})
 
+    def apart(self, effects, names):
+        return []
+
     def replaced(self, effects):
         return None
 
