@@ -23,7 +23,7 @@ _MOST_TOLERANCES = 2.0  # Of a nuisance parameter: farther off, its model is dou
 
 
 def evidence(result: GapResult) -> str:
-    """The effects by how much larger the held-out error is without each."""
+    """The effects by how much larger the error is without each."""
     known = []
     for each in result.effects:
         before, after = each.evidence.held_out_before, each.evidence.held_out_after
@@ -40,8 +40,9 @@ def evidence(result: GapResult) -> str:
         for ratio, each in known
     )
     note = (
-        '<p class="small">Held-out error without an effect, all others being in the '
-        "model, over the error with it; bars on a logarithmic scale.</p>"
+        '<p class="small">Error without an effect, all others being in the model, '
+        "over the error with it, on the data by which effects were chosen (the error "
+        "above is on data used for nothing); bars on a logarithmic scale.</p>"
     )
     title = "What each effect explains"
     return section(title, f"{note}<table class=bars>{rows}</table>")
