@@ -13,6 +13,8 @@ from makebreak.gap.residuals.driven import DrivenProblem
 from makebreak.gap.residuals.inverse import InverseModel
 from makebreak.gap.simulation.commands import Commands
 from makebreak.gap.simulation.driven_arm import DrivenArmSimulation
+from makebreak.gap.simulation.measure import gap_measure
+from makebreak.gap.simulation.windows import seen_in
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import ActuationSection
 
@@ -60,6 +62,33 @@ def test_gains_within_their_tolerance_are_no_gap(tmp_path):
     np.testing.assert_allclose(moved.kp, kp, rtol=0.02)
     np.testing.assert_allclose(moved.kd, kd, rtol=0.02)
     assert with_moved_gains(scene, n.names, b) is scene
+
+
+def test_windows_are_of_the_rows_that_a_slower_sensor_measured(tmp_path):
+    """Encoders at half of the log's rate, from its second row on."""
+    scene, recordings = scene_and_log(tmp_path)
+    whole = DrivenProblem(scene, recordings)
+
+    def without(*rows):
+        (log,) = recordings
+        channels = dict(log.channels)
+        for name in whole.channels:
+            values = channels[name].values.copy()
+            for of in rows:
+                values[of::2] = np.nan
+            channels[name] = replace(channels[name], values=values)
+        return [replace(log, channels=channels)]
+
+    slow = DrivenProblem(scene, without(0))
+    assert len(slow.windows) == len(whole.windows)
+    for window in slow.windows:
+        assert np.isfinite(seen_in(slow, window)).all()
+    held = [True] * len(slow.windows)
+    gap = gap_measure(slow, *[slow.simulate(())] * 2, held)
+    assert gap.is_measured and 0.5 < gap.before < 1.5
+    # Where nothing was measured no error of 0 is told.
+    slow.recordings = without(0, 1)
+    assert not gap_measure(slow, *[slow.simulate(())] * 2, held).is_measured
 
 
 def test_gains_beyond_their_tolerance_are_a_gap(tmp_path):

@@ -16,8 +16,8 @@ from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import Scene
 
 KEY = "drive_gains"  # Of a scene's `tolerance`.
-# As masses of links: torque constants and what loops at other rates make of a gain differ
-# by that much, and long logs show a fraction of it.
+# As masses of links: torque constants, and what loops at other rates make of a gain,
+# differ by that much, and long logs show a fraction of it.
 KNOWN_TO = 0.02
 _STEP = 0.01  # Of a gain, to see what it gives.
 

@@ -47,7 +47,8 @@ def gap_measure(
         windows count. Samples that were not measured, or that one of them does not
         tell, count in neither. why: why the simulation of window k stopped short,
         without or with the effects.
-    Returns: a measure of nothing (is_measured) where no window is simulated to its end.
+    Returns: a measure of nothing (is_measured) where no window that holds a measured
+        sample is simulated to its end.
     """
     picked = [k for k, h in enumerate(held) if h]
     failed = [
@@ -60,7 +61,8 @@ def gap_measure(
         with_effects = not any(failed[0])
         k = picked[failed[with_effects].index(True)]
         failure = _failure(model, k, why(k, with_effects), with_effects)
-    if not whole:
+    seen = [np.isfinite(seen_in(model, model.windows[k])).any() for k in whole]
+    if not any(seen):
         return GapMeasure(
             np.nan, np.nan, NOISE_FLOOR, 0.0,
             n_windows=len(picked), failed=count, failure=failure,

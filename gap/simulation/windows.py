@@ -121,6 +121,13 @@ class WindowedResidual:
         return np.tile(np.arange(k), n)[self.measured()]
 
 
+def _most_seen(seen: np.ndarray, every: int) -> int:
+    """The first of every so many rows from which most was measured, seen (n,): a sensor
+    that is slower than the log tells nothing in the rows between its samples."""
+    offsets = range(min(every, len(seen)))
+    return max(offsets, key=lambda at: float(np.mean(seen[at::every])))
+
+
 def n_rows(window) -> int:
     rows = window.rows
     return len(range(rows.start, rows.stop, rows.step or 1))
@@ -289,9 +296,11 @@ class WindowModel(WindowedResidual):
         # before is not known.
         margin = min(MARGIN_SEC, 0.1 * (time[-1] - time[0]))
         every = max(int(self.rows_sec / float(np.median(np.diff(time))) + 1e-6), 1)
+        seen = np.isfinite([recording[c][episode.rows] for c in self.channels]).sum(0)
         start_row = int(np.searchsorted(time, time[0] + margin))
         while start_row < len(time) - 3:
             start_row = self._best_start(time, states, start_row)
+            start_row += _most_seen(seen[start_row:], every)
             t0 = time[start_row]
             last = int(np.searchsorted(time, t0 + self.window_sec, "right"))
             if time[-1] - t0 < 0.6 * self.window_sec:
