@@ -1,6 +1,7 @@
 """The command line: what it refuses, what it writes, how it ends."""
 
 import fcntl
+import gc
 import inspect
 import io
 import json
@@ -12,7 +13,9 @@ import subprocess
 import sys
 import tempfile
 import termios
+import threading
 import time
+import weakref
 from functools import reduce
 from importlib import import_module
 from pathlib import Path
@@ -494,6 +497,28 @@ def test_meshcat_is_announced_and_stays_until_enter_at_a_terminal(capsys, monkey
     monkeypatch.setattr("sys.stdin", io.StringIO("more"))  # No terminal: ends at once.
     assert cli.main(["run", "spring_mass", "--out", "out"]) == 0
     assert "press Enter" not in capsys.readouterr().out
+
+
+def test_what_an_earlier_run_left_is_destroyed_by_the_main_thread(monkeypatch):
+    """A Meshcat that a thread destroys ends the process."""
+    left, seen = type("Left", (), {})(), []
+    left.itself = left
+    weakref.finalize(left, lambda: seen.append(threading.current_thread().name))
+    del left
+
+    def collects(*_):
+        gc.collect()
+        return 0, 0, {}
+
+    gc.disable()
+    try:
+        monkeypatch.setattr(trials._Running, "run", collects)
+        trials.run_many(
+            "spring_mass", [({}, 0)], 2, Path("out"), 1.0, command=spring_mass.COMMAND
+        )
+    finally:
+        gc.enable()
+    assert seen == ["MainThread"]
 
 
 def test_a_failing_run_is_reported_and_the_others_go_on(capsys):

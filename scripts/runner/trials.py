@@ -1,6 +1,7 @@
 """Runs many trials of an experiment in parallel, each in a process of its own: on the
 cores of this machine, or with joblib on a Dask or Ray cluster."""
 
+import gc
 import json
 import math
 import os
@@ -182,6 +183,9 @@ def run_commands(
     """
     results: list[dict] = [{} for _ in commands]
     running = _Running()
+    # What an earlier run left is destroyed here: Drake ends the process if one of the
+    # threads below does that with a Meshcat.
+    gc.collect()
 
     try:
         with (
