@@ -1,8 +1,9 @@
 """Gains of drives that are known to a share only: nuisances, like masses of links.
 
-A scene's `tolerance: {drive_gains: 0.05}` says how well they are known; KNOWN_TO if it
-does not say. What a drive's stiffness and damping give may then be off by that share,
-and is no effect.
+A scene's `tolerance: {drive_gains: 0.05}` says how well they are known. What a drive's
+stiffness and damping give may then be off by that share, and is no effect. Where it
+does not say, they are known to KNOWN_TO in simulated windows, which show less than
+that, and exactly in equations of motion.
 """
 
 from collections.abc import Iterator, Sequence
@@ -22,17 +23,12 @@ KNOWN_TO = 0.02
 _STEP = 0.01  # Of a gain, to see what it gives.
 
 
-def share_of(scene: Scene) -> float:
-    """Standard deviation of kp and kd, in shares of them; 0: they are known."""
-    return float(scene.tolerance.get(KEY, KNOWN_TO))
-
-
 def gain_changes(
     scene: Scene, joints: Sequence[str]
 ) -> Iterator[tuple[str, Effect, float]]:
     """(name, effect, size) of each joint's stiffness and damping, more by the share
     `size` that they are known to; none where the scene has no such tolerance."""
-    share = share_of(scene)
+    share = float(scene.tolerance.get(KEY, KNOWN_TO))
     for joint in joints if share else ():
         yield from _changes(scene, joint, share)
 
@@ -41,7 +37,7 @@ def with_moved_gains(scene: Scene, names: Sequence[str], values) -> Scene:
     """The scene with its drives as nuisances `names` have them; values (n_b,) in shares
     of a gain."""
     found = dict(zip(names, values, strict=True))
-    if not share_of(scene):
+    if not any(name.startswith(KEY) for name in found):
         return scene
     actuation = scene.actuation
     kp, kd = [], []
@@ -62,7 +58,7 @@ def gain_columns(model) -> tuple[list[np.ndarray], list[float], list[str]]:
     """Columns (m,) of the residual of an InverseModel, standard deviations and names:
     what each gain gives, per share of it."""
     columns, prior, names = [], [], []
-    share = share_of(model.scene)
+    share = float(model.scene.tolerance.get(KEY, 0.0))
     joints = [j for j, told in zip(model.joints, model.commanded, strict=True) if told]
     for joint in joints if share else ():
         i = model.joints.index(joint)
