@@ -676,6 +676,8 @@ def test_a_parameter_that_was_not_fitted_is_said_to_be_as_modelled():
         (1.8, 1e-12, "1.8 +- 1e-12"),
         (0.5, 0.0, "0.5"),
         (0.5, np.inf, "0.5"),
+        (0.01, 4e8, "0.01 (the data do not show it)"),
+        (3e8, 2e7, "3e+08 +- 2e+07"),
     ],
 )
 def test_a_value_has_the_digits_that_its_deviation_leaves(value, std, text):

@@ -293,12 +293,15 @@ def with_deviation(value: float, std: float, or_more: bool = False) -> str:
     """Text of value +- std with the significant digits: 0.03149 +- 0.00002.
 
     The std has one digit, or two if it begins with 1; without a finite std the value
-    has three digits. or_more: only a lower bound is known: "0.8 (at least 0.4)".
+    has three digits; one beyond all sense is none. or_more: only a lower bound is
+    known: "0.8 (at least 0.4)".
     """
     if or_more and 0.0 < std < np.inf:
         return f"{value:.2g} (at least {value - 2.0 * std:.2g})"
     if not 0.0 < std < np.inf:
         return f"{value:.3g}"
+    if std > 1e6 and std > 1e3 * abs(value):
+        return f"{value:.3g} (the data do not show it)"
     digits = 2 if f"{std:.0e}"[0] == "1" else 1
     decimals = digits - 1 - int(f"{std:.{digits - 1}e}".split("e")[1])
     size = int(f"{value:.0e}".split("e")[1]) if value else 0
