@@ -220,6 +220,16 @@ def test_what_moves_windows_less_than_the_scenes_step_is_not_named(step, kept):
         assert below == np.inf
 
 
+def test_nothing_is_simulated_for_the_step_where_no_window_was_measured(monkeypatch):
+    problem = Held({"arm.j1": (3.0, 1.0)})
+    selection = selection_of(problem)
+    nothing = Outcome(GapMeasure(np.nan, np.nan, 1.0, 0.0))
+    assert not nothing.gap.is_measured
+    monkeypatch.setattr(problem, "outcome", lambda *_, **__: pytest.fail("simulated"))
+    left, after, small, _ = above_step(problem, selection, nothing, 5.0, 1)
+    assert left is selection and after is nothing and not small
+
+
 def test_what_the_scenes_step_errs_by_is_no_gap():
     """Where windows agree, equations may show the world's own step, and no more."""
     agrees = GapMeasure(0.9, 0.9, 1.0, 0.3)

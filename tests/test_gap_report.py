@@ -16,7 +16,12 @@ from makebreak.gap.data.table import write_recording
 from makebreak.gap.report.clock import extents_of
 from makebreak.gap.report.comparison import comparison_html
 from makebreak.gap.report.files import write_report
-from makebreak.gap.report.interactive import _figure, _library, shown_series
+from makebreak.gap.report.interactive import (
+    _figure,
+    _library,
+    expected_of,
+    shown_series,
+)
 from makebreak.gap.report.pictures import picture_of_series, picture_of_where
 from makebreak.gap.report.sections import considered, evidence, series
 from makebreak.gap.report.summary import next_best, summary_lines
@@ -219,6 +224,17 @@ def test_the_plot_holds_what_was_measured_and_simulated_with_breaks_between_wind
         value = getattr(shown[0], trace["name"])
         y = [y for y in trace["y"] if y is not None]
         np.testing.assert_allclose(y, value, rtol=1e-5)  # Of six digits.
+    # The expected error: a closed band, there along its top and back along its bottom.
+    (band,) = [t for t in figure["data"] if t.get("fill") and t["xaxis"] == "x2"][:1]
+    first = band["x"].index(None)
+    time, edge = np.array(band["x"][:first]), np.array(band["y"][:first], dtype=float)
+    np.testing.assert_array_equal(time, time[::-1])
+    np.testing.assert_array_equal(edge, -edge[::-1])
+    half = first // 2
+    np.testing.assert_allclose(time[:half], shown[0].time[:half], atol=1e-9)
+    np.testing.assert_allclose(
+        edge[:half], 2.0 * expected_of(shown[0])[:half], rtol=1e-5
+    )
     # The errors: what is left fits in, of what was before only a part.
     low, high = figure["layout"]["yaxis2"]["range"]
     assert np.abs(shown[0].measured - shown[0].after).max() < high == -low
