@@ -16,7 +16,9 @@ A case whose run without fault does not roll is not judged, and does not count a
 """
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 
+from makebreak.benchmarks.rows import check_named
 from makebreak.diagrams.fault_kinds import ALWAYS, Injected, read_fault
 from makebreak.scripts.runner.table import Table
 from makebreak.scripts.runner.trials import run_many
@@ -156,13 +158,7 @@ def at_rest(runs: Sequence[Mapping], verdicts: Sequence[str]) -> int:
     return sum(r.get("tip_speed_end_m_s", float("nan")) <= AT_REST for r in held)
 
 
-def check(which: str, only: str) -> None:
-    """Raises: ValueError for a --set, which this command does not have, or an --only
-    that is in no fault."""
-    if which != "standard":
-        raise ValueError(f"--set: got {which}, and reproduce faults has no sets")
-    if not any(only in text for text in CASES):
-        raise ValueError(f"--only: got {only}, expected part of: {'; '.join(CASES)}")
+check = partial(check_named, "reproduce faults", CASES)
 
 
 def _worst(runs: Sequence[Mapping], key: str) -> str:

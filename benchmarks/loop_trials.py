@@ -5,8 +5,10 @@ Each trial is `makebreak close-the-loop EXPERIMENT --seed N`: a run with a wrong
 """
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
+from makebreak.benchmarks.rows import check_named
 from makebreak.scripts.runner.close_contact_loop import SETTINGS
 from makebreak.scripts.runner.table import Table
 from makebreak.scripts.runner.trials import makebreak_command, run_commands
@@ -20,13 +22,7 @@ FIRST_SEED = 0
 COLUMNS = ("what", "wrong model", "repaired model", "wanted", "seeds met")
 
 
-def check(which: str, only: str) -> None:
-    """Raises: ValueError for a --set, which this command does not have, or an --only
-    that is in no name."""
-    if which != "standard":
-        raise ValueError(f"--set: got {which}, and close_the_loop has no sets")
-    if not any(only in name for name in LOOPS):
-        raise ValueError(f"--only: got {only}, expected part of: {'; '.join(LOOPS)}")
+check = partial(check_named, "close_the_loop", LOOPS)
 
 
 def reproduce(

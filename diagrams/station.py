@@ -168,9 +168,9 @@ def make_station(
             image = faulty_image(
                 builder, image, config.camera, loaded, wrong.ball, config.seed, faults
             )
-        elif builder.HasSubsystemNamed("overhead_camera"):
+        else:  # Faults may delay images.
             camera = builder.GetSubsystemByName("overhead_camera")
-            if camera.HasInputPort("region"):  # Faults may delay images.
+            if camera.HasInputPort("region"):
                 builder.ExportInput(camera.GetInputPort("region"), "overhead.region")
         builder.ExportOutput(image, "overhead.rgb_image")
     if faults:

@@ -562,11 +562,21 @@ def csv_of(path: Path, columns: dict, header=None, text=None) -> Path:
     return path
 
 
-def clock_text(log: Log):
-    text = [f"22:{int(t // 60):02d}:{t % 60:09.6f}" for t in log.time]
-    log.columns = {"time": log.time} | log.columns
-    log.write = lambda folder, columns: csv_of(folder / "log.csv", columns, text=text)
-    return ("",)
+def with_text_times(write):
+    """Times as text, by what writes one [s]."""
+
+    def wrong(log: Log):
+        text = [write(t) for t in log.time]
+        log.columns = {"time": log.time} | log.columns
+        log.write = lambda to, columns: csv_of(to / "log.csv", columns, text=text)
+        return ("",)
+
+    return wrong
+
+
+clock_text = with_text_times(lambda t: f"22:{int(t // 60):02d}:{t % 60:09.6f}")
+# As pandas writes the time since a start.
+timedeltas = with_text_times(lambda t: f"0 days 00:00:{t:09.6f}")
 
 
 def with_index(log: Log):
@@ -875,14 +885,6 @@ def one_factor(what, factor, *words):
         return words if not all(log.slides) else ("",)
 
     return wrong
-
-
-def timedeltas(log: Log):
-    """As pandas writes the time since a start."""
-    text = [f"0 days 00:00:{t:09.6f}" for t in log.time]
-    log.columns = {"time": log.time} | log.columns
-    log.write = lambda folder, columns: csv_of(folder / "log.csv", columns, text=text)
-    return ("",)
 
 
 def half_turn(log: Log):

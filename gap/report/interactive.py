@@ -118,8 +118,9 @@ def _traces(each: Series, left: str, right: str, named: bool) -> list[dict]:
 
     band_t, band = [], []  # Closed shapes, one a window.
     cuts = [0, *sorted({int(s) for s in each.starts if s > 0}), len(each.time)]
+    expected = expected_of(each)
     for a, b in pairwise(cuts):
-        t, size = each.time[a:b], 2.0 * expected_of(each)[a:b]
+        t, size = each.time[a:b], 2.0 * expected[a:b]
         band_t += [*t, *t[::-1], np.nan]
         band += [*size, *-size[::-1], np.nan]
     found = [
