@@ -1,16 +1,17 @@
 """`makebreak bench parameter_learner`: what it is worth to learn masses and friction.
 
-Three plants whose planner's model is wrong: the error of the task without the learner,
+Four plants whose planner's model is wrong: the error of the task without the learner,
 with it, and with the right model; how far the learned values are off, and how often
 their 90 % intervals hold the truth. The world is Drake at 1 ms steps.
 
     door    a two-link arm pushes a door on a damped hinge to an angle, and lets it go
+    drawer  a finger pushes a drawer whose rail has Coulomb's friction to a place
     leg     a leg on a vertical rail falls, lands and holds its body at a height
     box     two fingers push a box over a table, in a plane, to a place
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pydrake.multibody.parsing import Parser
@@ -20,6 +21,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.benchmarks import plants as p
 from makebreak.diagrams.contact_mpc import ContactMpcConfig, make_contact_mpc
+from makebreak.models.effects.joint_forces import JointForces
 from makebreak.systems.contact_mpc.lcs_builder import ContactPair
 from makebreak.systems.contact_mpc.multibody.model_parameters import (
     POSITIVE,
@@ -30,6 +32,7 @@ from makebreak.systems.contact_mpc.parameter_learner import (
     ParameterLearner,
     ParameterLearnerConfig,
 )
+from makebreak.systems.numerics.joint_laws import coulomb_law
 
 FACTORS = (0.5, 2.0)  # Between which the truth is that of the model.
 NINETY = 1.645  # Deviations of a 90 % interval.
@@ -62,6 +65,7 @@ class Task:
     dt: float = 0.05
     u_max: float = np.inf
     seconds: float = 4.0
+    dry: str = ""  # Joint that has the value `coulomb` as its dry friction.
 
 
 def turning(child: str, parent: str, axis: str, damping: float, driven=True) -> str:
@@ -112,6 +116,28 @@ DOOR = Task(
     },
     [1.0, -2.0, 0.0], [0.4, -0.2, -0.5, 0.0, 0.0, 0.0],
     [0.0, 0.0, 300.0, 5.0, 5.0, 10.0], [0.02] * 2, 2, "mrad", N=20,
+)  # fmt: skip
+
+
+def drawer_world(v: dict) -> str:
+    front = p.shape("front", p.box(0.02 - 2.0 * v["gap"], 0.3, 0.2))
+    text = p.finger("tip", p.X, "-0.05 0 0", 0.02, 0.3, damping=2.0)
+    text += p.link("drawer", v["mass"], front)
+    return p.sdf(text, p.joint("drawer", "1 0 0", driven=False, damping=v["damping"]))
+
+
+DRAWER = Task(
+    "drawer", drawer_world,
+    lambda v: [ContactPair("tip", "drawer", 0.3, 1, plane_normal=[0, 0, 1])],
+    {"mass": 2.0, "damping": 3.0, "coulomb": 2.0, "gap": 0.0},
+    {
+        "mass": Parameter("mass", 0.5, "drawer"),
+        "damping": Parameter("damping", 0.5, "drawer_joint"),
+        "coulomb": Parameter("coulomb", 0.5, "drawer_joint", model=2.0),
+        "gap": Parameter("gap", 0.003, pairs=[0]),
+    },
+    [0.0, 0.0], [0.3, 0.3, 0.0, 0.0], [0.0, 300.0, 1.0, 5.0], [0.01], 1, "mm", N=15,
+    dry="drawer_joint",
 )  # fmt: skip
 
 
@@ -173,7 +199,7 @@ BOX = Task(
     [0.0, 0.0, *[0.0] * 4, 500.0, 500.0, 0.0, 1.0, 1.0, *[0.0] * 3, 5.0, 5.0, 0.0],
     [0.01] * 2, 6, "mm", N=10,
 )  # fmt: skip
-TASKS = {task.name: task for task in (DOOR, LEG, BOX)}
+TASKS = {task.name: task for task in (DOOR, DRAWER, LEG, BOX)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,12 +215,17 @@ class Run:
 def run(task: Task, true: dict, knows: bool, learns: bool) -> Run:
     """Args: true: the world's values; knows: whether the planner's model has them."""
     own = true if knows else task.values
+    model_items = {
+        name: replace(item, model=own[name]) if item.model else item
+        for name, item in task.learned.items()
+    }
     (model, _), builder = p.diagram_of(task.world(own)), DiagramBuilder()
     plant, _ = AddMultibodyPlantSceneGraph(builder, 0.001)
     Parser(plant).AddModelsFromString(task.world(true), "sdf")
     plant.Finalize()
     pairs, n_u = task.pairs(own), plant.num_actuated_dofs()
-    items = list(task.learned.values()) if learns else []
+    # What the model's plant does not have is given to its LCS in any case.
+    items = [i for i in model_items.values() if learns or i.model]
     limit = np.full(n_u, task.u_max)
     config = ContactMpcConfig(
         pairs, list(task.Q), list(task.R), list(task.x_desired), task.dt, task.dt,
@@ -203,6 +234,8 @@ def run(task: Task, true: dict, knows: bool, learns: bool) -> Run:
     )  # fmt: skip
     mpc = builder.AddSystem(make_contact_mpc(model, config))
     state = plant.get_state_output_port()
+    if task.dry:
+        add_dry_friction(builder, plant, task.dry, true["coulomb"])
     builder.Connect(state, mpc.GetInputPort("x"))
     builder.Connect(mpc.GetOutputPort("u"), plant.get_actuation_input_port())
     learner = None
@@ -233,6 +266,19 @@ def run(task: Task, true: dict, knows: bool, learns: bool) -> Run:
         far = np.log(value / right) if item.kind in POSITIVE else value - right
         off.append(far / item.std)
     return Run(1e3 * abs(error), values, np.array(off) / std)
+
+
+def add_dry_friction(builder, plant, joint: str, force: float) -> None:
+    """Coulomb's friction [N, N m] in a joint of the world, as the gap workflow's."""
+    laws = JointForces(
+        plant, [coulomb_law], [plant.GetJointByName(joint)], [[force, 1e-3]]
+    )
+    builder.AddSystem(laws)
+    builder.Connect(plant.get_state_output_port(), laws.GetInputPort("state"))
+    builder.Connect(
+        laws.GetOutputPort("generalized_force"),
+        plant.get_applied_generalized_force_input_port(),
+    )
 
 
 def drawn(task: Task, seed: int) -> dict:

@@ -13,10 +13,11 @@ from makebreak.benchmarks.plants import diagram_of
 from makebreak.systems.contact_mpc.lcs_builder import (
     AnitescuLcs,
     AnitescuLcsBuilder,
+    ContactPair,
     LcsBuilderConfig,
 )
 from makebreak.systems.contact_mpc.multibody.model_parameters import Parameter
-from makebreak.systems.contact_mpc.numerics.lcs import LCS
+from makebreak.systems.contact_mpc.numerics.lcs import LCS, simulate
 from makebreak.systems.contact_mpc.numerics.parameter_posterior import (
     Belief,
     Loss,
@@ -39,11 +40,23 @@ from makebreak.systems.contact_mpc.parameter_learner import (
     ParameterStatus,
 )
 
-DOOR, LEG, BOX = bench.DOOR, bench.LEG, bench.BOX
+DOOR, DRAWER, LEG, BOX = bench.DOOR, bench.DRAWER, bench.LEG, bench.BOX
 MORE = {  # Further parameters of the plants.
-    "door": [Parameter("com_y", 0.02, "door"), Parameter("mass", 0.5, "fore")],
-    "leg": [Parameter("damping", 0.5, "hip")] * 0,
-    "box": [Parameter("com_x", 0.005, "box"), Parameter("com_z", 0.005, "box")],
+    "door": [
+        Parameter("com_y", 0.02, "door"),
+        Parameter("mass", 0.5, "fore"),
+        Parameter("coulomb", 0.5, "fore_joint", model=0.05),
+        Parameter("coulomb", 0.2, "upper_joint"),
+        Parameter("force", 0.2, "door_joint"),
+        Parameter("force_x", 0.2, "fore"),
+    ],
+    "drawer": [Parameter("force", 0.5, "tip_joint")],
+    "leg": [Parameter("force_z", 1.0, "thigh")],
+    "box": [
+        Parameter("com_x", 0.005, "box"),
+        Parameter("com_z", 0.005, "box"),
+        Parameter("rolling", 1e-3, pairs=[1, 2]),
+    ],
 }
 
 
@@ -64,7 +77,7 @@ def state_of(model, task, rng):
 # How a step depends on the parameters.
 
 
-@pytest.mark.parametrize("task", [DOOR, LEG, BOX], ids=lambda t: t.name)
+@pytest.mark.parametrize("task", [DOOR, DRAWER, LEG, BOX], ids=lambda t: t.name)
 def test_changes_of_a_step_agree_with_finite_differences(task):
     """Also with forces, and away from the model's own values."""
     model, rng = model_of(task, MORE[task.name]), np.random.default_rng(0)
@@ -89,7 +102,7 @@ def test_changes_of_a_step_agree_with_finite_differences(task):
             np.testing.assert_allclose(dw[:, i], by_w, atol=1e-6 * abs(by_w).max())
         else:  # By differences of the learner's own.
             assert not dx[:, i].any() and not dw[:, i].any()
-            assert abs(by_w).max() > 0.0, p.names[i]
+            assert max(abs(by_w).max(), abs(by_x).max()) > 0.0, p.names[i]
 
 
 def test_values_of_parameters_are_those_of_a_plant_that_has_them():
@@ -123,6 +136,13 @@ def test_values_of_parameters_are_those_of_a_plant_that_has_them():
         (Parameter("mass", 0.5, "door", [0]), r"pairs is \[0\], expected none"),
         (Parameter("mass", 0.0, "door"), "std is 0.0, expected a positive number"),
         (Parameter("mass", 0.5, "door", drift=-1.0), "drift is -1.0, expected 0 or"),
+        (Parameter("mass", 0.5, "door", model=1.0), "model is 1.0, expected none"),
+        (
+            Parameter("coulomb", 0.5, "door_joint", model=-1.0),
+            "model is -1.0, expected",
+        ),
+        (Parameter("coulomb", 0.5, "hinge"), "no such joint, expected one of"),
+        (Parameter("force_x", 0.5, "gate"), "no such body, expected one of"),
     ],
 )
 def test_a_parameter_that_the_model_has_not_is_refused(item, said):
@@ -145,6 +165,70 @@ def test_values_of_a_wrong_size_are_refused():
     plain = AnitescuLcs(diagram_of(LEG.world(LEG.values))[0], LEG.pairs(LEG.values))
     with pytest.raises(ValueError, match="expected none: AnitescuLcs was made without"):
         plain.build(plain.x_default, np.zeros(2), parameters=[1.0])
+
+
+def test_coulombs_friction_slows_and_stops_but_never_drives():
+    """A drawer of 2 kg without contact, with 4 N in its rail, steps of 50 ms: at 1 m/s
+    it loses 0.1 m/s; at 0.05 m/s it stops; at rest 3 N move it as in one step."""
+    item = Parameter("coulomb", 0.5, "drawer_joint", model=4.0)
+    world = DRAWER.values | {"damping": 0.0}
+    diagram, _ = diagram_of(DRAWER.world(world))
+    model = AnitescuLcs(diagram, DRAWER.pairs(world), 0.05, parameters=[item])
+    for speed, after in ((1.0, 0.9), (-1.0, -0.9), (0.05, 0.0), (0.0, 0.0)):
+        x = np.array([-0.5, 0.0, 0.0, speed])
+        lcs = model.build(x, np.zeros(1))
+        x_next = lcs.A @ x + lcs.d
+        assert x_next[3] == pytest.approx(after, abs=1e-12)
+        # A plan that goes on from there: slower and slower, never backwards.
+        for _ in range(100):
+            x_next = lcs.A @ x_next + lcs.d
+            assert x_next[3] * speed >= -1e-12
+
+
+def test_a_joint_at_rest_tells_nothing_of_its_friction_and_one_in_motion_does():
+    item = Parameter("coulomb", 0.5, "drawer_joint", model=4.0)
+    diagram, plant = diagram_of(DRAWER.world(DRAWER.values))
+    model = AnitescuLcs(diagram, DRAWER.pairs(DRAWER.values), 0.05, parameters=[item])
+    M, args = np.diag([0.3, 2.0]), (np.array([4.0]), np.array([0.0]))
+    p = model.parameters
+    for ends, unknown in (((0.0, 0.0), 1), ((0.5, -0.5), 1), ((0.0, 0.5), 1),
+                          ((0.5, 0.45), 0), ((-0.5, -0.45), 0)):  # fmt: skip
+        v_now, v_next = (np.array([0.0, v]) for v in ends)
+        more = p.unknown_at_rest(*args, v_now, v_next, M, 0.05)
+        expected = np.diag([0.0, (0.05 * 4.0 / 2.0) ** 2])
+        np.testing.assert_allclose(more, unknown * expected)
+    for speed in (0.0, 0.5):
+        x = np.array([-0.5, 0.0, 0.0, speed])
+        lcs = model.build(x, np.zeros(1))
+        dx, _ = model.step_changes(x, np.zeros(1), lcs, np.zeros(lcs.n_lam), [4.0])
+        assert dx[3, 0] == pytest.approx(-0.05 / 2.0 * np.sign(speed))
+
+
+@pytest.mark.parametrize("way", [[1.0, 0.0], [-0.6, 0.8]])
+def test_a_rolling_ball_loses_what_its_lever_arm_takes(way):
+    """Lever arm 1 % of the radius: 0.01 g (5/7), whatever the direction."""
+    radius, mass, dt = 0.03, 0.07, 0.05
+    text = bench.p.ground(0.5) + bench.p.link(
+        "ball", mass, bench.p.shape("ball", bench.p.sphere(radius)),
+        arm=radius * np.sqrt(0.4),
+    )  # fmt: skip
+    text += bench.p.finger("tip", bench.p.X, "3 0 1")  # An LCS has an input.
+    item = Parameter("rolling", 0.5, pairs=[0], model=0.01 * radius)
+    pairs = [ContactPair("ball", "ground", 0.5)]
+    model = AnitescuLcs(diagram_of(bench.p.sdf(text))[0], pairs, dt, parameters=[item])
+    v = 0.5 * np.array(way)
+    x = model.x_default.copy()
+    x[model.n_q - 3 : model.n_q] = [0.0, 0.0, radius]
+    x[-3:] = [*v, 0.0]
+    x[-6:-3] = [-v[1] / radius, v[0] / radius, 0.0]
+    lcs = model.build(x, np.zeros(1))
+    # The contact's softness eps_c takes 1 % of the friction of a step.
+    x_next, _ = simulate(lcs, x, np.zeros(1))
+    lost = v - x_next[-3:-1]
+    np.testing.assert_allclose(lost, dt * 0.01 * 9.81 * 5 / 7 * 2 * v, rtol=0.15)
+    x[-6:] = 0.0
+    at_rest, _ = simulate(model.build(x, np.zeros(1)), x, np.zeros(1))
+    assert abs(at_rest[-6:-1]).max() < 1e-9
 
 
 # The belief.
@@ -304,7 +388,18 @@ def test_a_leg_learns_its_mass_and_where_the_ground_is(true):
     assert learned.error < 1.2 * right.error + 2.0  # [mm]
 
 
-@pytest.mark.parametrize("task", [DOOR, LEG, BOX], ids=lambda t: t.name)
+@pytest.mark.parametrize("true", [{"coulomb": 4.0}, {"coulomb": 1.0}], ids=str)
+def test_a_drawer_learns_the_dry_friction_of_its_rail(true):
+    learned = bench.run(DRAWER, DRAWER.values | true, knows=False, learns=True)
+    mass, damping, coulomb, gap = learned.values
+    # Damping and dry friction are told apart only as far as the speed varies.
+    assert coulomb == pytest.approx(true["coulomb"], rel=0.25)
+    assert mass == pytest.approx(2.0, rel=0.1)
+    assert (abs(learned.off[:3]) < 2.0).all()
+    assert abs(gap) < 2e-3
+
+
+@pytest.mark.parametrize("task", [DOOR, DRAWER, LEG, BOX], ids=lambda t: t.name)
 def test_with_the_right_model_nothing_is_invented(task):
     right = bench.run(task, task.values, knows=True, learns=False)
     learned = bench.run(task, task.values, knows=False, learns=True)

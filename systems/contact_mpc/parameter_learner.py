@@ -34,7 +34,7 @@ from makebreak.systems.contact_mpc.numerics.residual_learner import gamma_bound
 from makebreak.systems.numerics.settings import check_settings, check_times
 from makebreak.systems.numerics.timing import timed
 
-DIFFERENCE = 1e-6  # Of a friction, or of a gap [m], for its derivatives.
+DIFFERENCE = 1e-6  # Of a parameter of pairs, for its derivatives.
 NINETY = 1.645  # Deviations of a 90 % interval.
 GAP_STARTS = (-2.0, -1.0, 1.0, 2.0)  # Deviations of a gap to look for contact at.
 
@@ -92,7 +92,7 @@ class _Memory:
 
 
 class ParameterLearner(LeafSystem):
-    """Learns masses, centres of mass, damping, friction and gaps while the robot works.
+    """Learns masses, damping, friction, gaps and forces while the robot works.
 
     Inputs:  x (n_x,): measured state; u_measured (n_u,): mean of the input over the
              period that ends now; enable (1,), optional: 0 drops the steps that this
@@ -154,7 +154,7 @@ class ParameterLearner(LeafSystem):
         self._scale = Scale(
             m.parameters.nominal,
             np.array([p.std for p in c.parameters]),
-            np.array([p.kind in POSITIVE for p in c.parameters]),
+            m.parameters.is_log,
         )
         self._drift = np.array([p.drift for p in c.parameters]) ** 2 * period_sec
         self._config, n = c, len(c.parameters)
@@ -172,7 +172,13 @@ class ParameterLearner(LeafSystem):
             self.DeclareVectorOutputPort(name, size, calc, ticket)
 
         values = self._scale.values
-        output("parameters", n, lambda m: values(certain_part(m.belief)))
+        # No plan for a friction that drives.
+        lowest = [0.0 if p.kind in POSITIVE else -np.inf for p in c.parameters]
+
+        def to_plan_with(memory):
+            return np.maximum(values(certain_part(memory.belief)), lowest)
+
+        output("parameters", n, to_plan_with)
         output("estimate", n, lambda m: values(m.belief.mean))
         output("std", n, lambda m: m.belief.std)
         output("loss", 1, lambda m: m.loss)
@@ -228,9 +234,18 @@ class ParameterLearner(LeafSystem):
 
     def _learned(self, belief: Belief, sample: Sample):
         c, scale, model = self._config, self._scale, self.model
+        is_gap = np.array([p.kind == "gap" for p in c.parameters])
+        built: dict[bytes, Any] = {}  # By the values of all but the gaps.
+
+        def build_of(values):
+            rest = np.where(is_gap, 0.0, values)
+            key = rest.tobytes()
+            if key not in built:
+                built[key] = model.build(sample.x, sample.u, parameters=rest)
+            return model.with_gaps(built[key], values)
 
         def build(z):
-            return model.build(sample.x, sample.u, parameters=scale.values(z))
+            return build_of(scale.values(z))
 
         def changes(z, lcs, lam):
             values = scale.values(z)
@@ -238,8 +253,7 @@ class ParameterLearner(LeafSystem):
             for i in np.flatnonzero(~model.parameters.is_dynamic):
                 other = values.copy()
                 other[i] += DIFFERENCE
-                other = model.build(sample.x, sample.u, parameters=other)
-                both = changes_by(lcs, other, sample, loss, lam)
+                both = changes_by(lcs, build_of(other), sample, loss, lam)
                 dx[:, i], dw[:, i] = both[0] / DIFFERENCE, both[1] / DIFFERENCE
             return dx * scale.slopes(values), dw * scale.slopes(values)
 
@@ -262,16 +276,23 @@ class ParameterLearner(LeafSystem):
         """(n_x, n_x) of the step's errors, by what the forces under the belief do."""
         c, model = self._config, self.model
         lcs = build(belief.mean)
-        lacks, turned = step_of(lcs, sample, self._loss)[0], np.zeros(model.n_v)
+        lacks = step_of(lcs, sample, self._loss)[0]
+        values = self._scale.values(belief.mean)
+        further = model.parameters.unknown_at_rest(
+            values, self._scale.slopes(values) * belief.std,
+            sample.x_now[-model.n_v :], sample.x_next[-model.n_v :],
+            sample.M, model.dt_sec,
+        )  # fmt: skip
         found = explain(lcs, sample, self._loss)
         if found is not None and found.lam.any():
-            values = self._scale.values(belief.mean)
+            # Forces may act at the step's end instead of its beginning.
             before, after = (
                 pushes(model.build(x, sample.u, parameters=values))[0]
                 for x in (sample.x_now, sample.x_next)
             )
             impulse = model.dt_sec * (after - before).T @ found.lam
             turned = np.linalg.solve(sample.M, impulse)
+            further += np.outer(turned, turned) / 12.0
         impacts = c.impact_share**2 * impact_part(lcs, sample, lacks)
         share = np.sqrt(c.error_share**2 + impacts)
-        return error_weights(self._Q_d, share, lacks, sample.M, turned)
+        return error_weights(self._Q_d, share, lacks, sample.M, further)

@@ -53,8 +53,8 @@ class AnitescuLcs:
         x_default: (n_x,) the plant's default state.
         x_names, lam_names: of each state, and of each entry of lam, "geometry~geometry
             edge" (where the nearest are taken: "nearest k of geometry~... edge").
-        is_analytic: which of the two paths `build` takes; with parameters of bodies or
-            joints the general one.
+        is_analytic: which of the two paths `build` takes; with parameters of bodies,
+            joints or rolling the general one.
         parameters: their names and nominal values (ModelParameters).
 
     Raises: ValueError naming a pair that does not exist, a body without collision
@@ -100,7 +100,9 @@ class AnitescuLcs:
         )
         self._values = self.parameters.nominal
         self._model = None
-        if analytic and not self.parameters.is_dynamic.any():
+        if analytic and not (
+            self.parameters.is_dynamic.any() or self.parameters.has("rolling")
+        ):
             self._model = constant_mass_model(
                 plant, self._plant_context, inspector, self._dynamics, self._contacts,
                 self._points.frames,
@@ -174,6 +176,11 @@ class AnitescuLcs:
         friction = p.of_pairs("friction", values, friction)
         return friction, p.of_pairs("gap", values, gap)
 
+    def with_gaps(self, lcs: LCS, parameters) -> LCS:
+        """An LCS of this model whose gaps are not yet those of the parameters (n,)."""
+        gap = self.parameters.of_pairs("gap", parameters, np.zeros(self.n_pairs))
+        return self._contacts.with_gap(lcs, gap) if gap.any() else lcs
+
     def between(self, x, x_next) -> tuple[np.ndarray, np.ndarray]:
         """The constant velocity (n_v,) that leads from x to x_next, both (n_x,), in one
         time step, and the mass matrix (n_v, n_v) half-way."""
@@ -198,7 +205,7 @@ class AnitescuLcs:
         dx = np.zeros((self.n_x, len(p)))
         plant, context = self._plant, self._plant_context
         plant.SetPositionsAndVelocities(context, x)
-        torque = p.torque_changes(context, parameters, (x_next - x)[n_q:] / dt)
+        torque = p.torque_changes(context, parameters, (x_next - x)[n_q:] / dt, dt)
         dv = -dt * np.linalg.solve(plant.CalcMassMatrix(context), torque)
         N, _ = self._dynamics.velocity_maps(x[:n_q])
         dx[n_q:], dx[:n_q] = dv, dt * (N @ dv)
@@ -214,16 +221,30 @@ class AnitescuLcs:
     def _build_general(self, x, u, mu) -> LCS:
         """Smooth dynamics by AutoDiff, contacts from Drake's distance queries."""
         rows = self._contacts.rows
-        f, J_q, J_v, J_u, M = self._dynamics.linearise(x, u)  # Sets the context to x.
+        p, context = self.parameters, self._plant_context
+
+        def further(M):
+            return p.further_forces(context, self._values, M, self.dt_sec)
+
+        # Sets the context to x.
+        f, J_q, J_v, J_u, M = self._dynamics.linearise(x, u, further if p else None)
         phi, J, chosen = self._points.jacobians(self._plant_context)
         weight, F_0 = self._contacts.rows_of(chosen, mu)
         J_n, on = J[:, 0], rows.contact
         J_t = (rows.edge[:, :, None] * J[on, 1:]).sum(axis=1)
         J_c = rows.normal[:, None] * J[on, 0] + weight[:, None] * J_t
         N, N_plus = self._dynamics.velocity_maps(x[: self.n_q])
+        J_push = None
+        if p.has("rolling"):
+            lever = p.of_pairs("rolling", self._values, np.zeros(self.n_pairs))
+            lever = self._contacts.of_contacts(lever)[chosen]
+            against = self._points.against_rolling(
+                self._plant_context, chosen, lever, J_n, M, self.dt_sec
+            )
+            J_push = J_c - rows.normal[:, None] * against[on]
         return assemble_lcs(
             x, f, J_q, J_v, J_u, u, M, N, N_plus, phi, J_n, J_c, rows.contact,
-            rows.normal, F_0, self.dt_sec, chosen,
+            rows.normal, F_0, self.dt_sec, chosen, J_push,
         )  # fmt: skip
 
     def build_many(self, x, u) -> tuple[np.ndarray, ...]:

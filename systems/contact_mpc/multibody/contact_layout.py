@@ -90,6 +90,10 @@ class ContactLayout:
         F_0 = self.rows.F_0(mu, compliance, self._dt_sec, self._eps_c)
         return self.rows.weight(mu), F_0
 
+    def of_contacts(self, of_pairs) -> np.ndarray:
+        """(n,) of each contact, what (n_pairs,) of its pair is."""
+        return np.asarray(of_pairs)[self._pair_of]
+
     def friction_of(self, friction) -> np.ndarray:
         """(n,) friction of each contact, from that of the pairs (n_pairs,).
 

@@ -3,8 +3,17 @@
 mass              of a body [kg]; its inertia is in proportion, about its own centre
 com_x, _y, _z     its centre of mass in its frame [m]
 damping           of a joint [N m s/rad], or [N s/m]
+coulomb           Coulomb's friction in a joint [N m], or [N]
+force             constant one that acts in a joint [N m], or [N]
+force_x, _y, _z   constant one that acts at a body's origin, in the world's axes [N]
 friction          Coulomb's coefficient of a contact pair
+rolling           lever arm of the resistance of a contact pair to rolling [m]
 gap               what is added to the distances of a contact pair [m]
+
+Coulomb's friction is set-valued at rest. In a step it is the damping that has its
+force, but at most the one that stops the joint in the step: so a step from rest moves
+as far as the force in it lasts, and no friction ever drives a joint. Rolling resistance
+is a torque of lever arm times normal force against the rolling, and fades likewise.
 """
 
 from dataclasses import dataclass, field
@@ -13,16 +22,21 @@ import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
     BodyIndex,
+    JacobianWrtVariable,
     MultibodyForces,
     RotationalInertia_,
     SpatialInertia_,
 )
 from pydrake.systems.framework import Context
 
-KINDS = ("mass", "com_x", "com_y", "com_z", "damping", "friction", "gap")
-OF_PAIRS = ("friction", "gap")
-# Kinds whose values are positive: their deviation is one of the logarithm.
-POSITIVE = ("mass", "damping", "friction")
+OF_BODIES = ("mass", "com_x", "com_y", "com_z", "force_x", "force_y", "force_z")
+OF_JOINTS = ("damping", "coulomb", "force")
+OF_PAIRS = ("friction", "rolling", "gap")
+KINDS = (*OF_BODIES, *OF_JOINTS, *OF_PAIRS)
+# Kinds whose values are positive: where the model has one, their deviation is one of
+# the logarithm.
+POSITIVE = ("mass", "damping", "coulomb", "friction", "rolling")
+NOT_IN_PLANTS = ("coulomb", "force", "force_x", "force_y", "force_z", "rolling")
 
 
 @dataclass(frozen=True)
@@ -30,10 +44,12 @@ class Parameter:
     """A physical parameter of the model, and how well it is known.
 
     kind: one of KINDS. std: standard deviation of what the model says, of the logarithm
-    for mass, damping and friction (0.5: by a factor of 1.6), else [m]. of: name of the
-    body or the joint. pairs: for friction and gap, the numbers of the contact pairs
-    that have the value. drift: how much of it may be new after one second, in
-    deviations std per sqrt(s).
+    where the model has a positive mass, damping, friction or rolling resistance (0.5:
+    by a factor of 1.6), else in the kind's unit. of: name of the body or the joint.
+    pairs: for friction, rolling and gap, the numbers of the contact pairs that have the
+    value. drift: how much of it may be new after one second, in deviations std per
+    sqrt(s). model: the model's value of a kind that Drake's plants do not have
+    (coulomb, rolling, force).
     """
 
     kind: str
@@ -41,12 +57,15 @@ class Parameter:
     of: str = ""
     pairs: list[int] = field(default_factory=list)
     drift: float = 0.0
+    model: float = 0.0
 
 
 class ModelParameters:
     """The values of parameters in a plant's contexts, and the model's own.
 
-    Attributes: items; names, as "mass of door"; nominal (n,), in the units above.
+    Attributes: items; names, as "mass of door"; nominal (n,), in the units above;
+        is_log (n,), whether the deviation is the logarithm's; is_dynamic (n,), of
+        bodies and joints.
 
     Raises: ValueError naming the parameter and what is wrong with it.
     """
@@ -65,7 +84,12 @@ class ModelParameters:
             values.append(_nominal(p, name, plant, context, pair_friction))
         self.nominal = np.array(values)
         self.is_dynamic = np.array([p.kind not in OF_PAIRS for p in self.items], bool)
+        positive = np.array([p.kind in POSITIVE for p in self.items], bool)
+        self.is_log = positive & (self.nominal > 0.0)
         self._forces = MultibodyForces(plant)
+
+    def has(self, *kinds: str) -> bool:
+        return any(p.kind in kinds for p in self.items)
 
     def __len__(self) -> int:
         return len(self.items)
@@ -87,7 +111,7 @@ class ModelParameters:
             if p.kind == "damping":
                 joint = plant.GetJointByName(p.of)
                 joint.SetDampingVector(context, np.full(joint.num_velocities(), value))
-            elif p.kind not in OF_PAIRS:
+            elif p.kind in OF_BODIES and p.kind not in NOT_IN_PLANTS:
                 bodies.setdefault(p.of, {})[p.kind] = value
         for name, new in bodies.items():
             own = self._plant.GetBodyByName(name).default_spatial_inertia()
@@ -104,13 +128,52 @@ class ModelParameters:
             body = plant.GetBodyByName(name)
             body.SetSpatialInertiaInBodyFrame(context, inertia)
 
-    def torque_changes(self, context: Context, values, v_dot) -> np.ndarray:
+    def further_forces(self, context: Context, values, M, dt):
+        """(n_v,) forces [N, N m] and (n_v,) damping that Drake's plant does not have,
+        in a step of dt [s] from the context's state, with the mass matrix M."""
+        force, damping = np.zeros(len(M)), np.zeros(len(M))
+        for p, value in zip(self.items, values, strict=True):
+            if p.kind == "coulomb":
+                i = self._velocity(p)
+                speed = self._plant.GetVelocities(context)[i]
+                damping[i] = _coulomb_damping(value, speed, _stops(M, i, dt))
+            elif p.kind in NOT_IN_PLANTS and p.kind not in OF_PAIRS:
+                force += value * self._direction(context, p)
+        return force, damping
+
+    def unknown_at_rest(self, values, std, v_now, v_next, M, dt) -> np.ndarray:
+        """(n_v, n_v) covariance of a step's change of velocity by Coulomb's friction of
+        joints that rest or turn round in it: anything up to its greatest force.
+
+        Args: values, std (n,) of the parameters; v_now, v_next (n_v,) at the ends.
+        """
+        covariance = np.zeros((len(M), len(M)))
+        for p, value, deviation in zip(self.items, values, std, strict=True):
+            if p.kind == "coulomb":
+                i, force = self._velocity(p), np.hypot(value, deviation)
+                slow = min(v_now[i] * np.sign(v_next[i]), abs(v_next[i]))
+                if slow <= force * _stops(M, i, dt):
+                    change = dt * force * np.linalg.inv(M)[i]
+                    covariance += np.outer(change, change)
+        return covariance
+
+    def torque_changes(self, context: Context, values, v_dot, dt) -> np.ndarray:
         """(n_v, n) how the torque of the acceleration v_dot (n_v,) at the context's
         state changes with each dynamic parameter, by one inverse dynamics each: it is
         linear in a mass and a damping, and quadratic in a centre of mass."""
         out = np.zeros((len(v_dot), len(self)))
         for i in np.flatnonzero(self.is_dynamic):
-            size = 1e-3 if self.items[i].kind.startswith("com_") else 0.5 * values[i]
+            p = self.items[i]
+            if p.kind == "coulomb":
+                k, M = self._velocity(p), self._plant.CalcMassMatrix(context)
+                speed = self._plant.GetVelocities(context)[k]
+                if abs(values[i]) * _stops(M, k, dt) < abs(speed):
+                    out[k, i] = np.sign(speed)
+                continue
+            if p.kind in NOT_IN_PLANTS:
+                out[:, i] = -self._direction(context, p)
+                continue
+            size = 0.5 * values[i] if self.is_log[i] else 1e-3
             changed, sides = np.array(values, dtype=float), []
             for side in (1.0, -1.0):
                 changed[i] = values[i] + side * size
@@ -120,10 +183,36 @@ class ModelParameters:
         self.put(self._plant, context, values)
         return out
 
+    def _velocity(self, p: Parameter) -> int:
+        return self._plant.GetJointByName(p.of).velocity_start()
+
+    def _direction(self, context, p: Parameter) -> np.ndarray:
+        """(n_v,) generalized force of a force of 1."""
+        plant = self._plant
+        if p.kind == "force":
+            return np.eye(plant.num_velocities())[self._velocity(p)]
+        world = plant.world_frame()
+        J = plant.CalcJacobianTranslationalVelocity(
+            context, JacobianWrtVariable.kV, plant.GetBodyByName(p.of).body_frame(),
+            np.zeros(3), world, world,
+        )  # fmt: skip
+        return J["xyz".index(p.kind[-1])]
+
     def _torque(self, context, v_dot):
         plant = self._plant
         plant.CalcForceElementsContribution(context, self._forces)
         return plant.CalcInverseDynamics(context, v_dot, self._forces)
+
+
+def _stops(M, i: int, dt: float) -> float:
+    """Speed that a force of 1 in joint i stops in a step of dt [s]."""
+    return dt * np.linalg.inv(M)[i, i]
+
+
+def _coulomb_damping(force: float, speed: float, stops: float) -> float:
+    """Damping whose force is that of the friction `force`, or which stops the joint."""
+    most = max(abs(speed), abs(force) * stops)
+    return force / most if most > 0.0 else 0.0
 
 
 def _of(p: Parameter) -> str:
@@ -137,6 +226,11 @@ def _check(p: Parameter, name: str, n_pairs: int) -> None:
         raise ValueError(f"{name}: std is {p.std}, expected a positive number")
     if not (np.isfinite(p.drift) and p.drift >= 0.0):
         raise ValueError(f"{name}: drift is {p.drift}, expected 0 or more")
+    least = 0.0 if p.kind in POSITIVE else -np.inf
+    if not (np.isfinite(p.model) and p.model >= least):
+        raise ValueError(f"{name}: model is {p.model}, expected 0 or more")
+    if p.model and p.kind not in NOT_IN_PLANTS:
+        raise ValueError(f"{name}: model is {p.model}, expected none: the plant has it")
     if p.kind in OF_PAIRS:
         if not p.pairs or not all(pair in range(n_pairs) for pair in p.pairs):
             raise ValueError(f"{name}: expected numbers of pairs, 0 to {n_pairs - 1}")
@@ -145,8 +239,23 @@ def _check(p: Parameter, name: str, n_pairs: int) -> None:
 
 
 def _nominal(p: Parameter, name: str, plant, context, pair_friction) -> float:
-    if p.kind == "gap":
-        return 0.0
+    if p.kind in OF_JOINTS:
+        if not plant.HasJointNamed(p.of):
+            known = [plant.get_joint(i).name() for i in plant.GetJointIndices()]
+            raise ValueError(f"{name}: no such joint, expected one of {known}")
+        n = plant.GetJointByName(p.of).num_velocities()
+        if n == 0:
+            raise ValueError(f"{name}: the joint does not move")
+        if n > 1 and p.kind != "damping":
+            raise ValueError(f"{name}: the joint has {n} velocities, expected one")
+    if p.kind in OF_BODIES and not plant.HasBodyNamed(p.of):
+        bodies = map(BodyIndex, range(plant.num_bodies()))
+        known = [plant.get_body(i).name() for i in bodies]
+        raise ValueError(f"{name}: no such body, expected one of {known}")
+    if p.kind in NOT_IN_PLANTS or p.kind == "gap":
+        return p.model
+    if p.kind == "damping":
+        return float(plant.GetJointByName(p.of).GetDampingVector(context)[0])
     if p.kind == "friction":
         different = {float(pair_friction[pair]) for pair in p.pairs}
         if len(different) != 1:
@@ -154,19 +263,7 @@ def _nominal(p: Parameter, name: str, plant, context, pair_friction) -> float:
                 f"{name}: the pairs have {sorted(different)}, expected one"
             )
         value = different.pop()
-    elif p.kind == "damping":
-        if not plant.HasJointNamed(p.of):
-            known = [plant.get_joint(i).name() for i in plant.GetJointIndices()]
-            raise ValueError(f"{name}: no such joint, expected one of {known}")
-        vector = plant.GetJointByName(p.of).GetDampingVector(context)
-        if vector.size == 0:
-            raise ValueError(f"{name}: the joint does not move")
-        value = float(vector[0])
     else:
-        if not plant.HasBodyNamed(p.of):
-            bodies = map(BodyIndex, range(plant.num_bodies()))
-            known = [plant.get_body(i).name() for i in bodies]
-            raise ValueError(f"{name}: no such body, expected one of {known}")
         inertia = plant.GetBodyByName(p.of).default_spatial_inertia()
         if p.kind.startswith("com_"):
             return float(inertia.get_com()["xyz".index(p.kind[-1])])

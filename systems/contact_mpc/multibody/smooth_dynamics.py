@@ -40,9 +40,13 @@ class SmoothDynamics:
         parameters.put(self._plant, self._context, values)
         parameters.put(self._plant_ad, self._context_ad, values, AutoDiffXd)
 
-    def linearise(self, x: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, ...]:
+    def linearise(
+        self, x: np.ndarray, u: np.ndarray, further=None
+    ) -> tuple[np.ndarray, ...]:
         """f (n_v,) at x = [q, v] (n_x,) and u (n_u,), its derivatives J_q (n_v, n_q),
         J_v (n_v, n_v) and J_u (n_v, n_u), and M (n_v, n_v). Sets the context to x.
+
+        Args: further: M -> (n_v,) forces and (n_v,) damping that the plant lacks.
 
         M f = tau(u) - r(q, v), so M df = dtau - d(M(q) f* + r) at the fixed f*: one
         inverse dynamics in AutoDiff, and no derivative of a factorised M.
@@ -54,6 +58,8 @@ class SmoothDynamics:
         M = plant.CalcMassMatrix(context)
         plant.CalcForceElementsContribution(context, self._forces)
         r = plant.CalcInverseDynamics(context, np.zeros(self.n_v), self._forces)
+        force, damping = np.zeros((2, self.n_v)) if further is None else further(M)
+        r += damping * x[self.n_q :] - force
         try:
             f = np.linalg.solve(M, self._B_tau @ u - r)
         except np.linalg.LinAlgError as error:
@@ -67,6 +73,7 @@ class SmoothDynamics:
         dtau: Any = ExtractGradient(tau)  # The stubs' array shapes are wrong.
         if dtau.shape[1] == 0:  # Nothing depends on the state.
             dtau = np.zeros((self.n_v, self.n_q + self.n_v))
+        dtau[:, self.n_q :] += np.diag(damping)
         J = np.linalg.solve(M, np.hstack([-dtau, self._B_tau]))
         J_q, J_v, J_u = np.split(J, [self.n_q, self.n_q + self.n_v], axis=1)
         return f, J_q, J_v, J_u, M

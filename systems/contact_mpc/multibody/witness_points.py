@@ -12,8 +12,8 @@ from makebreak.systems.contact_mpc.multibody.contact_layout import ContactLayout
 from makebreak.systems.contact_mpc.numerics.contact_rows import tangent_basis
 from makebreak.systems.contact_mpc.numerics.convex_hull import point_on_hull
 
-# Distances below this one are too short for a direction [m].
-TOUCHING = 1e-7
+GRAVITY = 9.81  # [m/s2]
+TOUCHING = 1e-7  # Distances below this one are too short for a direction [m].
 
 
 class WitnessPoints:
@@ -87,6 +87,38 @@ class WitnessPoints:
             t1, t2 = tangent_basis(n, layout.reference[i])
             J[k] = np.stack([n, t1, t2]) @ J_w
         return phi, J, chosen
+
+    def against_rolling(self, context: Context, chosen, lever, J_n, M, dt):
+        """(n_contacts, n_v) generalized force of the resistance to rolling, for a
+        normal force of 1 in each contact, at the state of the plant's context.
+
+        The torque is the lever arm (n_contacts,) [m] against the rolling part of the
+        bodies' relative angular velocity. It fades where a weight of what the normal
+        J_n (n_contacts, n_v) moves would stop the rolling in a step of dt [s].
+        """
+        plant, layout, world = self._plant, self._layout, self._plant.world_frame()
+        query: Any = self._query_port.Eval(context)
+        v, out = plant.GetVelocities(context), np.zeros((len(chosen), len(M)))
+        for k, i in enumerate(chosen):
+            if lever[k] == 0.0:
+                continue
+            id_A, id_B = layout.geometries[i]
+            n = self.distance(query, id_A, id_B)[1]
+            J_A, J_B = (
+                plant.CalcJacobianAngularVelocity(
+                    context, JacobianWrtVariable.kV, self.frames[of][0], world, world
+                )
+                for of in (id_A, id_B)
+            )
+            J = (np.eye(3) - np.outer(n, n)) @ (J_A - J_B)
+            rate = J @ v
+            speed = np.linalg.norm(rate)
+            along = rate / speed if speed > 0.0 else np.zeros(3)
+            mobility = along @ J @ np.linalg.solve(M, J.T @ along)
+            moved = J_n[k] @ np.linalg.solve(M, J_n[k])
+            stopped = dt * abs(lever[k]) * GRAVITY * mobility / moved
+            out[k] = lever[k] * min(speed / max(stopped, 1e-300), 1.0) * (along @ J)
+        return out
 
     def _distances(self, context: Context):
         """distance() of all contacts. Where two geometries just touch, Drake's normal

@@ -24,7 +24,7 @@ NOT_FINITE = "the linearised contact model has an entry that is not finite"
 
 def assemble_lcs(
     x, f, J_q, J_v, J_u, u, M, N, N_plus, phi, J_n, J_c, contact, normal, F_0, dt,
-    number=None,
+    number=None, J_push=None,
 ):  # fmt: skip
     """The LCS of one linearised time step.
 
@@ -34,7 +34,8 @@ def assemble_lcs(
             (n_v, n_v), J_u (n_v, n_u) its derivatives.
         M: (n_v, n_v) mass matrix. N: (n_q, n_v), qdot = N v. N_plus: (n_v, n_q).
         phi: (n_contacts,) gaps [m]; J_n: (n_contacts, n_v), their rates per v.
-        J_c: (n_lam, n_v), what each force pushes along.
+        J_c: (n_lam, n_v), what each force pushes along; J_push: the same with what
+            else it does, as against rolling; None: nothing.
         contact: (n_lam,) integers, the contact of each force. normal (n_lam,): 1.0
             where w holds the contact's gap, else 0.0. F_0 (n_lam, n_lam): see the
             module. dt: time step [s]. number: (n_contacts,) what the contacts are
@@ -53,7 +54,7 @@ def assemble_lcs(
         np.ascontiguousarray(J_v, dtype=float),
         np.ascontiguousarray(J_u, dtype=float),
         np.ascontiguousarray(u, dtype=float),
-        np.linalg.solve(M, J_c.T),
+        np.linalg.solve(M, (J_c if J_push is None else J_push).T),
         np.ascontiguousarray(N, dtype=float),
         np.ascontiguousarray(N_plus, dtype=float),
         np.ascontiguousarray(phi, dtype=float),

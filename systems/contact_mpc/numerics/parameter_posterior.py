@@ -62,19 +62,19 @@ def prior(n: int) -> Belief:
 
 @dataclass(frozen=True, eq=False)
 class Scale:
-    """z of physical values: nominal exp(std z) where positive, else nominal + std z."""
+    """z of physical values: nominal exp(std z) where is_log, else nominal + std z."""
 
     nominal: np.ndarray  # (n,)
     std: np.ndarray  # (n,)
-    positive: np.ndarray  # (n,) bool
+    is_log: np.ndarray  # (n,) bool
 
     def values(self, z) -> np.ndarray:
-        grown = self.nominal * np.exp(np.where(self.positive, self.std * z, 0.0))
-        return np.where(self.positive, grown, self.nominal + self.std * z)
+        grown = self.nominal * np.exp(np.where(self.is_log, self.std * z, 0.0))
+        return np.where(self.is_log, grown, self.nominal + self.std * z)
 
     def slopes(self, values) -> np.ndarray:
         """(n,) derivative of the values in z."""
-        return np.where(self.positive, values, 1.0) * self.std
+        return np.where(self.is_log, values, 1.0) * self.std
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,19 +138,18 @@ def step_of(lcs: LCS, sample: Sample, loss: Loss):
     return lacks, w + opening_speed(lcs, sample.x_next, loss.slip_noise)
 
 
-def error_weights(Q_d, share, lacks, M, turned=0.0) -> np.ndarray:
+def error_weights(Q_d, share, lacks, M, further=0.0) -> np.ndarray:
     """(n_x, n_x) inverse covariance of a step's errors.
 
     Args: Q_d (n_x,) inverse variances that do not depend on the step; lacks (n_x,): the
         measured change that is not that of free motion; share: further error in parts
         of the size of `lacks`, as the mass matrix M (n_v, n_v) measures it, in any
-        direction; turned (n_v,): change of the velocities that the forces make if they
-        act at the step's end instead of its beginning, as when they act is not known.
+        direction; further: (n_v, n_v) covariance of the velocities' other errors.
     """
     n_v = len(M)
     W = np.diag(np.asarray(Q_d, dtype=float))
     size = share**2 * (lacks[-n_v:] @ M @ lacks[-n_v:]) / n_v
-    more = size * np.linalg.inv(M) + np.outer(turned, turned) / 12.0
+    more = size * np.linalg.inv(M) + further
     if more.any():  # (1 / Q + more)^-1, as Q may be zero.
         Q = W[-n_v:, -n_v:]
         W[-n_v:, -n_v:] = Q @ np.linalg.inv(np.eye(n_v) + more @ Q)
