@@ -1,7 +1,8 @@
-"""Exports a scene's mechanism with its effects as URDF, MJCF or drives of Isaac Lab.
+"""Exports a scene's mechanism with its effects as URDF, SDF, MJCF or drives of Isaac
+Lab.
 
-Both formats have inertias, damping, Coulomb friction (which Drake's parser ignores) and
-rotor inertias. Effects that a format cannot express are listed in `omitted`.
+The first three have inertias, damping, Coulomb friction (which Drake's parser ignores)
+and rotor inertias. Effects that a format cannot express are listed in `omitted`.
 """
 
 import re
@@ -40,6 +41,7 @@ from makebreak.models.effects.model_text import (
     children,
     make_mesh_paths_absolute,
     model_path,
+    set_text,
     write_inertial,
 )
 from makebreak.models.scene import LoadedScene, Scene, load_scene
@@ -107,9 +109,21 @@ def to_urdf(scene: Scene, model: str) -> Exported:
 
     Raises: ValueError if the model comes from no URDF.
     """
-    files = urdf_models(scene)
+    return _own_file(scene, model, ".urdf")
+
+
+def to_sdf(scene: Scene, model: str) -> Exported:
+    """As to_urdf, of a model that comes from an SDF file."""
+    return _own_file(scene, model, ".sdf")
+
+
+def _own_file(scene: Scene, model: str, suffix: str) -> Exported:
+    files = models_of(scene, suffix)
     if model not in files:
-        raise ValueError(f"{model!r} comes from no URDF, so none can be written of it")
+        kind = suffix[1:].upper()
+        raise ValueError(
+            f"{model!r} comes from no {kind}, so none can be written of it"
+        )
     loaded = _load(scene)
     plant = loaded.plant
     document = minidom.parse(str(files[model]))
@@ -124,20 +138,24 @@ def to_urdf(scene: Scene, model: str) -> Exported:
             if inertial.mass == 0.0:
                 continue
             own = link.appendChild(document.createElement("inertial"))
-            own.appendChild(document.createElement("mass")).setAttribute("value", "0")
-            own.appendChild(document.createElement("inertia"))
+            mass = own.appendChild(document.createElement("mass"))
+            inertia = own.appendChild(document.createElement("inertia"))
+            if suffix == ".urdf":
+                mass.setAttribute("value", "0")
+            else:
+                inertia.appendChild(document.createElement("ixx"))
         write_inertial(link, inertial)
     omitted = list(_unsaid(scene))
     for index in plant.GetJointIndices(instance):
         joint = plant.get_joint(index)
         if isinstance(joint, (RevoluteJoint, PrismaticJoint)):
-            omitted += _urdf_joint(loaded, joint, document)
+            omitted += _file_joint(loaded, joint, document)
     make_mesh_paths_absolute(document, files[model].parent)
     return Exported(document.toxml() + "\n", tuple(omitted))
 
 
-def urdf_models(scene: Scene) -> dict[str, Path]:
-    """{model: its file} of the models that come from URDFs."""
+def models_of(scene: Scene, suffix: str) -> dict[str, Path]:
+    """{model: its file} of the models that come from such files (.urdf or .sdf)."""
     parser = Parser(MultibodyPlant(0.0))
     flat = FlattenModelDirectives(
         ModelDirectives(directives=scene.directives), parser.package_map()
@@ -147,7 +165,7 @@ def urdf_models(scene: Scene) -> dict[str, Path]:
         for d in flat.directives
         if d.add_model is not None
     }
-    return {name: file for name, file in files.items() if file.suffix == ".urdf"}
+    return {name: file for name, file in files.items() if file.suffix == suffix}
 
 
 def _load(scene: Scene) -> LoadedScene:
@@ -166,7 +184,7 @@ def _load(scene: Scene) -> LoadedScene:
     if free or others:
         raise ValueError(
             f"{', '.join([*free, *others])}: only mechanisms of joints that turn or "
-            "slide are written as URDF and MJCF"
+            "slide are written as URDF, SDF and MJCF"
         )
     return loaded
 
@@ -360,37 +378,53 @@ def to_isaac_lab(scene: Scene) -> Exported:
     return Exported(text + "}\n", _unsaid(scene, ("delay",)))
 
 
-def _urdf_joint(loaded: LoadedScene, joint: Joint, document) -> list[str]:
-    """Writes a joint's damping, friction and rotor. Returns: what cannot be written."""
+def _file_joint(loaded: LoadedScene, joint: Joint, document) -> list[str]:
+    """Writes a joint's damping, friction and rotor into a URDF or an SDF file. Returns:
+    what cannot be written."""
     plant = loaded.plant
     (element,) = [
         e for e in document.getElementsByTagName("joint")
         if e.getAttribute("name") == joint.name() and e.hasAttribute("type")
     ]  # fmt: skip
-    found = children(element, "dynamics")
-    if not found:
-        found = [element.appendChild(document.createElement("dynamics"))]
-    found[0].setAttribute("damping", repr(float(joint.default_damping_vector()[0])))
-    found[0].setAttribute("friction", repr(_sum_of(loaded, joint, "friction")))
+    dynamics = {
+        "damping": repr(float(joint.default_damping_vector()[0])),
+        "friction": repr(_sum_of(loaded, joint, "friction")),
+    }
     rotor = _rotor(plant, joint)
-    if rotor == 0.0:
+    drakes = {"rotor_inertia": repr(rotor), "gear_ratio": repr(1.0)} if rotor else {}
+    if drakes:
+        document.documentElement.setAttribute("xmlns:drake", "http://drake.mit.edu")
+    if children(element, "axis", "xyz"):  # SDF: numbers are texts, not attributes.
+        at = _only(_only(element, "axis"), "dynamics")
+        for tag, value in dynamics.items():
+            set_text(_only(at, tag), value)
+        for tag, value in drakes.items():
+            set_text(_only(element, f"drake:{tag}"), value)
+        return []
+    for key, value in dynamics.items():
+        _only(element, "dynamics").setAttribute(key, value)
+    if not drakes:
         return []
     for transmission in document.getElementsByTagName("transmission"):
         names = [j.getAttribute("name") for j in children(transmission, "joint")]
         for actuator in children(transmission, "actuator"):
             if joint.name() not in names:
                 continue
-            root = document.documentElement
-            root.setAttribute("xmlns:drake", "http://drake.mit.edu")
-            for tag, value in (("rotor_inertia", rotor), ("gear_ratio", 1.0)):
-                for old in children(actuator, f"drake:{tag}"):
-                    actuator.removeChild(old)
-                new = document.createElement(f"drake:{tag}")
-                new.setAttribute("value", repr(value))
-                actuator.appendChild(new)
+            for tag, value in drakes.items():
+                _only(actuator, f"drake:{tag}").setAttribute("value", value)
             return []
     return [f"{full_name(plant, joint)} turns a rotor with {rotor:.3g}, and has no "
             "transmission to write it to"]  # fmt: skip
+
+
+def _only(parent: minidom.Element, tag: str) -> minidom.Element:
+    """The child of this name; made if there is none."""
+    found = children(parent, tag)
+    if found:
+        return found[0]
+    made = minidom.Document().createElement(tag)
+    made.ownerDocument = parent.ownerDocument
+    return parent.appendChild(made)
 
 
 def _rotor(plant: MultibodyPlant, joint: Joint) -> float:

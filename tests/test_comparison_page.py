@@ -29,7 +29,7 @@ from makebreak.gap.verdict import says
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import InitialSection, load_scene
 from makebreak.models.scene_schema import ActuationSection
-from makebreak.scripts.cli.gap_command import effects_table
+from makebreak.scripts.cli.gap_command import effects_table, write_comparison
 
 COULOMB = Effect("joint_coulomb_friction", ["p.j1"], {"coulomb": 0.35})
 TIME = np.arange(300) * 0.01
@@ -287,3 +287,31 @@ def test_what_stands_still_does_not_hide_what_moves(at):
     assert side[:2] @ np.array(at) > 0.6 * np.linalg.norm(at) * np.linalg.norm(side[:2])
     assert side[2] > 0.0
     np.testing.assert_array_equal(_side(target, []), _side(target, [target]))
+
+
+def test_what_the_page_shows_is_written_as_mcap_too(tmp_path):
+    from test_mcap_file import messages  # Skips without the libraries.
+
+    scene, recordings = swung(tmp_path, "servo")
+    result = result_of(WindowModel(scene, recordings, 0.3), [COULOMB], scene)
+    named = NamedEffect(
+        "joint_coulomb_friction", ("p.j1",), {"coulomb": Estimate(0.35, 0.01, "N m")},
+        "Joint p.j1 has friction.", Evidence(9.0, 1.0, "", np.nan),
+    )  # fmt: skip
+    result = replace(result, effects=[named])
+    assert write_comparison(result, scene, recordings, tmp_path / "c.mcap") == []
+    found = messages(tmp_path / "c.mcap")
+    [series] = result.series
+    for who in ("measured", "before", "after"):
+        times, states = found[f"/{who}/joint_states"]
+        y = getattr(series, who)
+        there = np.isfinite(y)
+        np.testing.assert_array_equal([m.position[0] for m in states], y[there])
+        np.testing.assert_allclose(
+            1e-9 * np.array(times), series.time[there], atol=1e-9
+        )
+        (shapes,) = found[f"/{who}/shapes"][1]
+        assert {m.header.frame_id.split("/")[0] for m in shapes.markers} == {who}
+    still = replace(result, series=[])
+    (note,) = write_comparison(still, scene, recordings, tmp_path / "no.mcap")
+    assert "no motion was simulated" in note

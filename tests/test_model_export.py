@@ -3,6 +3,7 @@
 import sys
 import types
 from dataclasses import replace
+from xml.etree import ElementTree as ET
 
 import mujoco
 import numpy as np
@@ -206,6 +207,49 @@ def test_a_urdf_has_what_the_repaired_scene_has(tmp_path):
         np.testing.assert_allclose(found[1], found[0], rtol=1e-9)
 
 
+# Without the products of inertia that may be left out, and a link without any inertia.
+SDF = """<sdf version="1.9"><model name="d"><link name="base"/>
+<link name="upper"><inertial><pose>0 0 -0.25 0.3 0 0</pose><mass>1.2</mass><inertia>
+<ixx>0.03</ixx><iyy>0.03</iyy><izz>0.004</izz></inertia></inertial></link>
+<link name="lower"><pose relative_to="upper">0 0 -0.5 0 0 0</pose><inertial>
+<mass>0.7</mass><inertia><ixx>0.02</ixx><iyy>0.02</iyy><izz>0.003</izz>
+<ixy>0.001</ixy></inertia></inertial></link>
+<joint name="j1" type="revolute"><parent>base</parent><child>upper</child><axis>
+<xyz>0 1 0</xyz></axis></joint>
+<joint name="j2" type="revolute"><parent>upper</parent><child>lower</child><axis>
+<xyz>0 1 0</xyz><dynamics><damping>0.05</damping></dynamics></axis></joint>
+</model></sdf>"""
+
+
+def test_sdf_moves_as_the_scene(tmp_path):
+    base = double(tmp_path)
+    (tmp_path / "d.sdf").write_text(SDF)
+    base.directives[0].add_model.file = f"file://{tmp_path / 'd.sdf'}"
+    of_body = [each for each in SAID if each[0] != "gravity_tilt"]
+    scene = with_effects(base, *of_body)
+    exported_text = exported(scene, ["sdf"])["d.sdf"]
+    assert "Not in this file" not in exported_text
+    (tmp_path / "again.sdf").write_text(exported_text)
+    again = double(tmp_path)
+    again.directives[0].add_model.file = f"file://{tmp_path / 'again.sdf'}"
+    rng = np.random.default_rng(0)
+    for q in rng.uniform(-2.0, 2.0, (3, 2)):
+        found = []
+        for each in (scene, again):
+            plant = load_scene(each, DiagramBuilder()).plant
+            context = plant.CreateDefaultContext()
+            plant.SetPositions(context, q)
+            damping = [plant.GetJointByName(j).default_damping() for j in ("j1", "j2")]
+            found.append([
+                *plant.CalcMassMatrix(context).ravel(),
+                *plant.CalcGravityGeneralizedForces(context), *damping,
+            ])  # fmt: skip
+        np.testing.assert_allclose(found[1], found[0], rtol=1e-9)
+    joint = ET.fromstring(exported_text.rpartition("\n<!--")[0] or exported_text)
+    said = [float(x.text) for x in joint.iter("friction")]
+    assert said == [0.4, 0.0]  # Drake reads no friction; Gazebo does.
+
+
 def test_what_a_format_cannot_say_is_told(tmp_path):
     scene = with_effects(double(tmp_path), *SAID, LOST)
     (said,) = to_mjcf(scene).omitted
@@ -225,7 +269,9 @@ def test_the_command_writes_what_is_asked_for(tmp_path):
     assert sorted(files) == ["d.urdf", "repaired.xml"]
     assert "<!-- Not in this file: joint d.j1 has drag" in files["repaired.xml"]
     in_mujoco(files["repaired.xml"])  # A comment after the end is no error.
-    with pytest.raises(ValueError, match="--export: got 'sdf', expected some of urdf"):
+    with pytest.raises(ValueError, match="--export: got 'step', expected some of urdf"):
+        exported(scene, ["step"])
+    with pytest.raises(ValueError, match="no model of the scene comes from SDF"):
         exported(scene, ["sdf"])
-    with pytest.raises(ValueError, match="no model of the scene comes from a URDF"):
+    with pytest.raises(ValueError, match="no model of the scene comes from URDF"):
         exported(on_ground(tmp_path, "cube"), ["urdf"])

@@ -99,7 +99,7 @@ terminal("makebreak gap arm.urdf monday.csv --out monday")
 # %%
 # The friction is named, with its interval. Open ``monday/report.html``: how much of
 # the error is explained, what fits nearly as well, how certain each number is.
-# ``monday/scene.yaml`` is the repaired model, and ``--export urdf,mjcf,isaaclab``
+# ``monday/scene.yaml`` is the repaired model, and ``--export urdf,sdf,mjcf,isaaclab``
 # writes it for other simulators. ``monday/proposed_scene.yaml`` and
 # ``monday/monday.yaml`` say what ``gap`` assumed about the robot and the columns.
 # Where that is wrong, correct it, and run ``gap`` on the corrected files.

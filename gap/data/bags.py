@@ -19,6 +19,8 @@ BAGS = (".bag", ".mcap", ".db3")
 TICKS = 4096  # A turn of a LeRobot arm's motor.
 LONGEST_ARRAY = 64  # Longer ones are pictures, maps, clouds.
 _JOINT_STATE = "sensor_msgs/msg/JointState"
+# What is only shown: it says again what other topics say.
+_DRAWN = ("visualization_msgs/", "tf2_msgs/")
 _TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 # [s] Topics whose stamps differ from the bag's by more than this, or by one another's
 # offsets, are on clocks of their own.
@@ -57,6 +59,8 @@ def read_bag(
         with highlevel.AnyReader([path], default_typestore=store) as reader:
             for connection, received, raw in reader.messages():
                 if connection.topic in unused or connection.topic in unread:
+                    continue
+                if connection.msgtype.startswith(_DRAWN):
                     continue
                 try:
                     message = reader.deserialize(raw, connection.msgtype)

@@ -36,12 +36,12 @@ _HELD_SEC = 0.4  # At a window's end, where models are farthest from what was me
 _JUMP_SEC = 1e-3  # From there to the start of the next one.
 _FRAMES = 360
 _QUATERNION = ("qw", "qx", "qy", "qz")
-_COLOURS = {
+COLOURS = {
     "measured": Rgba(0.62, 0.66, 0.72, 0.45),
     "before": Rgba(0.85, 0.50, 0.20, 0.9),
     "after": Rgba(0.17, 0.42, 0.69, 0.9),
 }
-_STILL = Rgba(0.82, 0.82, 0.80, 1.0)
+STILL = Rgba(0.82, 0.82, 0.80, 1.0)
 _SAYS = {"before": "the given model", "after": "with the named effects"}
 
 
@@ -64,14 +64,11 @@ class Motion:
     left_out: int
 
 
-def comparison_html(
+def comparison(
     result: GapResult, scene: Scene, recordings: Sequence[Recording]
-) -> str | None:
-    """The page: measured as a ghost, the scene as it came, and with the effects, in the
-    windows of the report, with their error as a number.
-
-    Returns: None if no motion was simulated, or there is no place for Drake's viewer.
-    """
+) -> tuple[Motion, dict[str, LoadedScene]] | None:
+    """What moves in the windows of the report, and {"before", "after" (if anything was
+    named), "measured": the scene in which it does}; None if no motion was simulated."""
     own = load_scene(scene, DiagramBuilder())
     motion = shown_motion(result, own.plant, recordings)
     if motion is None:
@@ -84,16 +81,30 @@ def comparison_html(
         effects = [*scene.effects, *result.effects_in(motion.recording)]
         repaired = replace(scene, effects=effects)
         loaded["after"] = load_scene(repaired, DiagramBuilder())
+    return motion, {**loaded, "measured": loaded.get("after", loaded["before"])}
+
+
+def comparison_html(
+    result: GapResult, scene: Scene, recordings: Sequence[Recording]
+) -> str | None:
+    """The page: measured as a ghost, the scene as it came, and with the effects, in the
+    windows of the report, with their error as a number.
+
+    Returns: None if no motion was simulated, or there is no place for Drake's viewer.
+    """
+    compared = comparison(result, scene, recordings)
+    if compared is None:
+        return None
+    motion, drawn = compared
     meshcat = _quiet_meshcat()
     if meshcat is None:
         return None
     rows, play, slow = _frames(motion)
-    drawn = {**loaded, "measured": loaded.get("after", loaded["before"])}
     _draw(meshcat, drawn, motion, rows, play)
     zeros = {r.name: zero_of(float(r.time[0])) for r in recordings}
     zero = zeros.get(motion.recording, 0.0)
-    sliding = sliding_joints(own.plant)
-    errors = {who: errors_of(motion, who, sliding) for who in loaded}
+    sliding = sliding_joints(drawn["before"].plant)
+    errors = {who: errors_of(motion, who, sliding) for who in drawn if who in _SAYS}
     return _with_numbers(meshcat.StaticHtml(), motion, errors, rows, play, zero, slow)
 
 
@@ -128,7 +139,7 @@ def shown_motion(
         return None
     rows = np.concatenate(kept)
     time = first.time[rows]
-    columns: dict[str, dict[str, np.ndarray]] = {w: {} for w in _COLOURS}
+    columns: dict[str, dict[str, np.ndarray]] = {w: {} for w in COLOURS}
     for each in some:
         for who, of in columns.items():
             of[each.channel] = getattr(each, who)[rows]
@@ -263,21 +274,22 @@ def _draw(
     seen: list[np.ndarray] = []
     behind: list[np.ndarray] = []
     for who, one in loaded.items():
-        moving, still = _shapes(one)
+        moving, still = shapes_of(one)
         if who == "measured":
             for path, body, pose, shape in still:
-                _put(meshcat, f"/scene/{path}", shape, _STILL, pose)
+                _put(meshcat, f"/scene/{path}", shape, STILL, pose)
                 meshcat.SetTransform(f"/scene/{path}", body @ pose)
                 behind.append((body @ pose).translation())
         for path, _, pose, shape in moving:
-            _put(meshcat, f"/{who}/{path}", shape, _COLOURS[who], pose)
+            _put(meshcat, f"/{who}/{path}", shape, COLOURS[who], pose)
         plant, context = one.plant, one.plant.CreateDefaultContext()
         bodies = {path.split("/")[0]: body for path, body, _, _ in moving}
         columns = {
-            name: _known(value, motion) for name, value in motion.columns[who].items()
+            name: between_samples(value, motion)
+            for name, value in motion.columns[who].items()
         }
         for row, now in zip(rows, play, strict=True):
-            _set_positions(plant, context, columns, row)
+            set_positions(plant, context, columns, row)
             for path, body in bodies.items():
                 X_WB = plant.EvalBodyPoseInWorld(context, body)
                 meshcat.SetTransform(f"/{who}/{path}", X_WB, float(now))
@@ -319,7 +331,7 @@ def _put(meshcat: Meshcat, path: str, shape, colour: Rgba, pose: RigidTransform)
     meshcat.SetTransform(path, pose)
 
 
-def _shapes(loaded: LoadedScene) -> tuple[list, list]:
+def shapes_of(loaded: LoadedScene) -> tuple[list, list]:
     """(path, body, pose in it, shape) of what moves, and of what stands still (with
     the body's pose in world in place of the body). A body without a shape to be seen
     shows those it touches with; a mechanism of balls, or of nothing, has rods."""
@@ -386,7 +398,7 @@ def _sticks(plant: MultibodyPlant, context: Context) -> list:
     return found
 
 
-def _known(value: np.ndarray, motion: Motion) -> np.ndarray:
+def between_samples(value: np.ndarray, motion: Motion) -> np.ndarray:
     """(n,) with a line between what is known in a window: slow sensors have few rows,
     and before a delayed channel shows anything it stands still."""
     out = np.array(value)
@@ -397,7 +409,7 @@ def _known(value: np.ndarray, motion: Motion) -> np.ndarray:
     return out
 
 
-def _set_positions(plant, context, columns: Mapping[str, np.ndarray], row: int):
+def set_positions(plant, context, columns: Mapping[str, np.ndarray], row: int):
     q = plant.GetPositions(context)
     for joint in one_dof_joints(plant):
         value = columns.get(f"{full_name(plant, joint)}.position")
@@ -433,7 +445,7 @@ def _with_numbers(
     that the player shows."""
 
     def dot(who: str) -> str:
-        c = _COLOURS[who]
+        c = COLOURS[who]
         rgb = ",".join(str(round(255 * x)) for x in (c.r(), c.g(), c.b()))
         return f'<span style="color:rgb({rgb})">&#9679;</span>'
 

@@ -273,9 +273,29 @@ def make_parser(functions: Mapping[str, Callable]) -> argparse.ArgumentParser:
     p.add_argument(
         "--export",
         metavar="FORMATS",
-        help="also write the repaired model: urdf, mjcf, isaaclab (its drives), or "
-        "several of them, separated by commas",
+        help="also write the repaired model: urdf, sdf, mjcf, isaaclab (its drives), "
+        "and mcap, what was measured and simulated; several are separated by commas",
     )
+
+    p = commands.add_parser(
+        "convert",
+        help="write logs and their motion as MCAP, for Foxglove or PlotJuggler",
+    )
+    p.add_argument(
+        "scene", metavar="SCENE", help="what moves: as of `gap`, a scene or a robot"
+    )
+    p.add_argument(
+        "recordings", nargs="+", metavar="RECORDING", help="logs, as of `gap`"
+    )
+    p.add_argument("--sidecar", metavar="FILE", help=sidecar_help)
+    p.add_argument(
+        "--skip-bad-rows", action="store_true", help="skip rows that cannot be read"
+    )
+    p.add_argument(
+        "--to", default="mcap", metavar="FORMATS",
+        help="mcap (default), rrd (of rerun, if it is installed), or mcap,rrd",
+    )  # fmt: skip
+    p.add_argument("--out", metavar="DIR", help="output folder (runs/convert-<time>)")
 
     p = commands.add_parser(
         "judge", help="measure how well scenes predict recordings, without any fit"
@@ -414,7 +434,7 @@ def make_parser(functions: Mapping[str, Callable]) -> argparse.ArgumentParser:
 
     p = commands.add_parser("completion", help="print the script for tab completion")
     p.add_argument("shell", metavar="SHELL", help="bash, zsh, fish or tcsh")
-    for name in ("run", "gap", "export-tests"):
+    for name in ("run", "gap", "convert", "export-tests"):
         commands.choices[name].add_argument(
             "--package", action="append", default=[], metavar="NAME=PATH",
             help="folder that package://NAME in model files stands for",

@@ -238,6 +238,25 @@ def _gap_until(args, interrupt, drake) -> int:
     return 130 if is_interrupted else 0
 
 
+def _convert(args) -> int:
+    from makebreak.gap.data.recording_files import ROBOTS, recording_files
+    from makebreak.scripts.cli.convert_command import convert
+
+    scene = Path(args.scene)
+    if scene.suffix.lower() not in ROBOTS or not scene.is_file():
+        scene = Path(scene_file(args.scene, "SCENE"))
+    files, notes = convert(
+        scene, recording_files(args.recordings),
+        Path(args.out) if args.out else default_out("convert"),
+        Path(args.sidecar) if args.sidecar else None, args.skip_bad_rows,
+        args.to.split(","),
+    )  # fmt: skip
+    for note in notes:
+        print(note)
+    print_files(files)
+    return 0
+
+
 def _judge(args) -> int:
     from makebreak.scripts.cli.judge import judge_scenes
 
@@ -404,6 +423,7 @@ _COMMANDS: dict[str, Callable[[Namespace], int]] = {
     "reproduce": _reproduce,
     "sweep": _sweep,
     "gap": _gap,
+    "convert": _convert,
     "judge": _judge,
     "design-log": _design_log,
     "inspect": _inspect,

@@ -7,6 +7,7 @@ import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from importlib.util import find_spec
 from math import isfinite
 from pathlib import Path
 from shlex import quote
@@ -18,9 +19,11 @@ from tqdm import tqdm
 from makebreak.gap.budget import REPORT, Budget
 from makebreak.gap.data.findings import NO_COLUMN, Finding
 from makebreak.gap.data.reading import read_recordings
+from makebreak.gap.data.recording import Recording
 from makebreak.gap.data.sidecar import has_sidecar, has_sidecars, sidecar_of
-from makebreak.gap.report.comparison import comparison_html
+from makebreak.gap.report.comparison import comparison, comparison_html
 from makebreak.gap.report.files import write_report
+from makebreak.gap.report.mcap_file import write_mcap
 from makebreak.gap.report.summary import next_best, summary_lines, windows_of
 from makebreak.gap.result import GapResult
 from makebreak.models.scene import Scene, read_scene
@@ -32,7 +35,7 @@ from makebreak.scripts.runner.outputs import OutputFolder
 from makebreak.scripts.runner.shown import is_quiet, print_files
 from makebreak.scripts.runner.table import Table
 
-EXPORTS = ("urdf", "mjcf", "isaaclab")
+EXPORTS = ("urdf", "sdf", "mjcf", "isaaclab", "mcap")
 NO_ANIMATION = "compare.html was not made"
 
 
@@ -126,7 +129,7 @@ def run_and_report(
     seconds = 60.0 * budget_min
     with OutputFolder(out_dir, "gap", inputs) as out:
         if is_robot:
-            scene_path, recording_paths, sidecars, notes, doubts = _proposed(
+            scene_path, recording_paths, sidecars, notes, doubts = proposed(
                 scene_path, recording_paths, out, out_dir, sidecar
             )
             print_files(out.keep(), sys.stderr)
@@ -172,6 +175,10 @@ def run_and_report(
                 repaired = replace(scene, effects=effects)
                 for name, text in exported(repaired, export).items():
                     out.file(name).write_text(text)
+                if "mcap" in export:
+                    notes += write_comparison(
+                        result, scene, recordings, out.file("compare.mcap")
+                    )
         except (Exception, SystemExit) as error:  # Drake raises SystemExit, too.
             if isinstance(error.__cause__ or error, OSError) and any(out.written()):
                 kept = ", ".join(path.name for path in out.commit(complete=False))
@@ -236,7 +243,7 @@ def known_sidecars(
     return found, notes
 
 
-def _proposed(
+def proposed(
     robot_path: Path,
     recording_paths: Sequence[Path],
     out: OutputFolder,
@@ -294,16 +301,18 @@ def name_from(folder: Path, robot: Path, proposed_scene: Path) -> None:
 
 def exported(scene: Scene, formats: Sequence[str]) -> dict[str, str]:
     """{file name: text} of a scene's models in other formats: `repaired.xml` (MJCF),
-    `isaaclab_actuators.py`, and `<model>.urdf` for each model that comes from a URDF.
+    `isaaclab_actuators.py`, and `<model>.urdf` or `<model>.sdf` for each model that
+    comes from such a file.
     Effects that a format cannot express are listed in a comment at its end.
 
     Raises: ValueError for an unknown format, or a scene that it cannot express.
     """
     from makebreak.models.model_export import (
+        models_of,
         to_isaac_lab,
         to_mjcf,
+        to_sdf,
         to_urdf,
-        urdf_models,
     )
 
     found = {}
@@ -312,16 +321,25 @@ def exported(scene: Scene, formats: Sequence[str]) -> dict[str, str]:
             raise ValueError(
                 f"--export: got {each!r}, expected some of {', '.join(EXPORTS)}"
             )
+        if each == "mcap":  # What moves is no text: write_comparison.
+            if find_spec("rosbags") is None:
+                raise ValueError(
+                    "--export mcap needs rosbags: pip install 'makebreak[ros]'"
+                )
+            continue
         if each == "mjcf":
             found["repaired.xml"] = to_mjcf(scene)
             continue
         if each == "isaaclab":
             found["isaaclab_actuators.py"] = to_isaac_lab(scene)
             continue
-        models = urdf_models(scene)
+        models = models_of(scene, f".{each}")
         if not models:
-            raise ValueError("--export urdf: no model of the scene comes from a URDF")
-        found |= {f"{model}.urdf": to_urdf(scene, model) for model in models}
+            raise ValueError(
+                f"--export {each}: no model of the scene comes from {each.upper()}"
+            )
+        write = to_urdf if each == "urdf" else to_sdf
+        found |= {f"{model}.{each}": write(scene, model) for model in models}
     texts = {}
     for name, one in found.items():
         comment = "# {}\n" if name.endswith(".py") else "<!-- {} -->\n"
@@ -330,6 +348,17 @@ def exported(scene: Scene, formats: Sequence[str]) -> dict[str, str]:
         )
         texts[name] = one.text + lost
     return texts
+
+
+def write_comparison(
+    result: GapResult, scene: Scene, recordings: Sequence[Recording], path: Path
+) -> list[str]:
+    """Writes compare.mcap, what compare.html shows. Returns: what to say of it."""
+    compared = comparison(result, scene, recordings)
+    if compared is None:
+        return [f"{path.name} was not written: no motion was simulated."]
+    motion, loaded = compared
+    return write_mcap(path, [motion], loaded)
 
 
 def effects_table(result: GapResult) -> Table:
