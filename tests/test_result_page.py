@@ -2,6 +2,7 @@
 
 import re
 
+from makebreak.scripts.cli.commands import _of_targets
 from makebreak.scripts.runner.result_page import result_page
 from makebreak.scripts.runner.table import Table
 
@@ -14,17 +15,40 @@ def test_what_was_missed_comes_first_and_text_is_no_html():
     assert "Goals missed" in page and "<iframe" not in page
     assert '<li class="error">MISSED  error: 3 &lt; 2</li>' in page
     assert "<li>met     rests: yes</li>" in page
-    cells = re.findall(r"<td>(.*?)</td>", page)
+    assert '<td class="error">MISSED</td>' in page
+    cells = re.findall(r"<td.*?>(.*?)</td>", page)
     assert cells == ["&lt;b&gt;x&lt;/b&gt;", "-", "", "y", "0.25", "MISSED"]
     assert "a note" in page and "<pre>" not in page
 
 
 def test_plots_and_the_animation_are_in_it_and_long_tables_are_folded():
-    table = Table("t", ("n",), [(k,) for k in range(30)])
+    table = Table("t", ("n",), [(k,) for k in range(42)])
     page = result_page(
         "t", [table], True, pictures={"a.png": b"png"}, is_moving=True, command="go"
     )
     assert "Goals met" in page and 'alt="a.png" src="data:image/png;base64,' in page
     assert 'src="meshcat.html#small"' in page and "<pre>go</pre>" in page
     shown, _, folded = page.partition("<details>")
-    assert "18 more" in folded and ">11<" in shown and ">12<" in folded
+    assert "18 more" in folded and ">23<" in shown and ">24<" in folded
+
+
+def test_few_cases_of_many_values_stand_side_by_side():
+    columns = ("case", *"abcdefgh")
+    rows = [(name, *range(8)) for name in ("adapt=true", "adapt=false")]
+    page = result_page("t", [Table("t", columns, rows)])
+    assert re.findall(r"<th>(.*?)</th>", page) == ["case", "adapt=true", "adapt=false"]
+    assert page.count("<tr>") == 9
+    assert 'class="two"' not in page  # Nothing to stand in it.
+
+
+def test_a_reproduction_says_which_targets_are_missed():
+    rows = [("force", "8 N", "9 N", "run"), ("time", "3 s", "2 s", "run")]
+    heads = ("what", "paper", "ours", "command")
+    both = Table("Walls", heads, rows, [False, True])
+    none = Table("Others", heads, rows)
+    page = result_page("t", *_of_targets([both, none]))
+    assert "Goals missed" in page and "Walls: 1 of 2 targets met" in page
+    assert '<li class="error">MISSED force: paper 8 N, ours 9 N</li>' in page
+    assert "Goals" not in result_page("t", *_of_targets([none]))
+    met = Table("Walls", heads, rows, [True, True])
+    assert "Goals met" in result_page("t", *_of_targets([met]))

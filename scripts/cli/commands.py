@@ -145,7 +145,7 @@ def _reproduce_in(session, modules, seeds: int, jobs: int, args, seed) -> int:
         session.write_text(
             "reproduce.md", "\n".join(t.to_markdown() for t in tables.values())
         )
-        page = result_page("makebreak reproduce", list(tables.values()))
+        page = result_page("makebreak reproduce", *_of_targets(tables.values()))
         session.write_text("report.html", page)
 
     for name, module in modules.items():
@@ -165,6 +165,25 @@ def _reproduce_in(session, modules, seeds: int, jobs: int, args, seed) -> int:
     if missed:
         print(f"makebreak: {missed} rows miss their target", file=sys.stderr)
     return 1 if missed else 0
+
+
+def _of_targets(tables) -> tuple[list, bool | None, list[str]]:
+    """The tables, whether all targets in them are met (None: there are none), and
+    lines of how many are, and of each that is not."""
+    tables, lines = list(tables), []
+    for table in tables:
+        pairs = list(zip(table.cells()[1], table.met, strict=False))
+        of = [met for _, met in pairs if met is not None]
+        if of:
+            lines.append(
+                f"{table.title}: {sum(map(bool, of))} of {len(of)} targets met"
+            )
+        for row, met in pairs:
+            if met is not None and not met:
+                named = zip(table.columns[1:3], row[1:3], strict=False)
+                values = ", ".join(f"{name} {value}" for name, value in named)
+                lines.append(f"MISSED {row[0]}: {values}")
+    return tables, not sum(t.missed for t in tables) if lines else None, lines
 
 
 def _sweep(args) -> int:
@@ -190,8 +209,7 @@ def _sweep(args) -> int:
     table, files = run_sweep(
         sweep, out, number_of_processes(args.jobs), args.cluster, inputs=inputs
     )
-    is_wide = len(table.columns) > len(table.rows) + 1
-    show(table, table.transposed() if is_wide else None)
+    show(table, table.transposed() if table.is_wide else None)
     print_files(files)
     return 1 if table.notes else 0  # A note: a trial failed.
 

@@ -8,7 +8,7 @@ from makebreak.gap.report.markup import STYLE, folded, image
 from makebreak.scripts.runner.table import Table
 
 _GOOD, _BAD, _NEUTRAL = "#2f855a", "#c53030", "#2b6cb0"
-_MOST_ROWS = 12  # Of a table; others are shown when they are asked for.
+_MOST_ROWS = 24  # Of a table; others are shown when they are asked for.
 
 
 def result_page(
@@ -40,7 +40,9 @@ def result_page(
     body = [
         f'<p class="badge" style="background:{colour}">{badge}</p>',
         f"<h1>{escape(title)}</h1>",
-        f'<div class="two"><ul>{lines}</ul><div>{moving}</div></div>',
+        f'<div class="two"><ul>{lines}</ul><div>{moving}</div></div>'
+        if lines or moving
+        else "",
         *(f"<section>{image(pictures, name, name)}</section>" for name in pictures),
         *map(_table, tables),
     ]
@@ -54,12 +56,19 @@ def result_page(
     )
 
 
+def _cell(text: str) -> str:
+    missed = ' class="error"' if text == "MISSED" else ""
+    return f"<td{missed}>{escape(text)}</td>"
+
+
 def _table(table: Table) -> str:
+    # A run's has a row a value; a sweep's few cases have a column for each value.
+    table = table.transposed() if table.is_wide and len(table.columns) > 6 else table
     heads, rows = table.cells()
     head = "".join(f"<th>{escape(each)}</th>" for each in heads)
 
     def some(rows):
-        lines = ("".join(f"<td>{escape(cell)}</td>" for cell in row) for row in rows)
+        lines = ("".join(map(_cell, row)) for row in rows)
         return f"<table><tr>{head}</tr><tr>{'</tr><tr>'.join(lines)}</tr></table>"
 
     shown = some(rows[:_MOST_ROWS])

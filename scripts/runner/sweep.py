@@ -205,8 +205,12 @@ def _run(sweep: Sweep, outputs: OutputFolder, jobs, cluster, command):
         path = outputs.file(f"{key.replace('.', '_')}.png")
         _plot(sweep, key, runs, results, measured).savefig(path, dpi=120)
         pictures[path.name] = path.read_bytes()
+    says = []
+    if "success" in table.columns:
+        k = list(table.columns).index("success")
+        says = [f"{row[0]}: success {row[k]}" for row in table.cells()[1]]
     page = result_page(
-        f"makebreak sweep {sweep.experiment}", [table], None, (), pictures
+        f"makebreak sweep {sweep.experiment}", [table], None, says, pictures
     )
     outputs.file("report.html").write_text(page)
     return table, outputs.commit()

@@ -50,6 +50,11 @@ class Table:
         """Number of rows that miss their target."""
         return sum(1 for met in self.met if met is not None and not met)
 
+    @property
+    def is_wide(self) -> bool:
+        """Whether it is better read turned round: few rows of many columns."""
+        return len(self.columns) > len(self.rows) + 1
+
     def cells(self) -> tuple[list[str], list[list[str]]]:
         """Headings and rows as text; with a last column for the targets, if any."""
         heads = [str(c) for c in self.columns]
@@ -81,7 +86,7 @@ class Table:
         return "\n".join(lines) + "\n"
 
     def transposed(self) -> "Table":
-        """Columns as rows: for few rows of many columns in a terminal."""
+        """Columns as rows, for a table that is wide."""
         heads, rows = self.cells()
         names = [heads[0], *(row[0] for row in rows)]
         turned = list(zip(heads[1:], *(row[1:] for row in rows), strict=True))
