@@ -49,6 +49,8 @@ engine.RenderColorImage(ColorRenderCamera(core, False), ImageRgba8U(8, 8))
 
 @dataclass
 class CameraConfig:
+    """The overhead camera: image, place, renderer, noise."""
+
     width: int = 320  # Width of the image [px].
     height: int = 240  # Height of the image [px].
     # Angle of view along the image's height, which is the world's x [rad].

@@ -68,6 +68,8 @@ def _learner() -> ResidualLearnerConfig:
 
 @dataclass
 class CartpoleWallsConfig:
+    """Settings of `makebreak run cartpole_walls`."""
+
     seed: int = 0  # Seed of the initial state, drawn around x_initial.
     # Mean initial state: position of the cart [m], angle of the pole [rad], and their
     # velocities. Default: at rest, the tip 24 cm towards wall 0.

@@ -108,6 +108,8 @@ WRENCH = f"{ARM}.external_wrench"  # The station's port of the measured wrench.
 
 @dataclass
 class ChangingContactConfig:
+    """Settings of the systems that handle changing contacts, sensors to torques."""
+
     tare: WrenchTareConfig = field(default_factory=WrenchTareConfig)
     detector: ContactDetectorConfig = field(default_factory=ContactDetectorConfig)
     modes: ModeDetectorConfig = field(default_factory=ModeDetectorConfig)

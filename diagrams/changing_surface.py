@@ -95,6 +95,8 @@ def _control() -> ChangingContactConfig:
 
 @dataclass
 class ChangingSurfaceConfig:
+    """Settings of `makebreak run changing_surface`."""
+
     # Seed of the frictions, the normal forces, the station's errors and the noise.
     seed: int = 0
     tool: str = "block"  # Tool on the arm: block or sphere.

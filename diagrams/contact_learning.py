@@ -72,6 +72,8 @@ BACK = 0.03  # Length of the last segment, in which the third contact is held [m
 
 @dataclass
 class ContactLearningConfig:
+    """Settings of `makebreak run contact_learning`."""
+
     seed: int = 0  # Seed of the world, the initial estimates and the noise.
     tool: str = "block"  # Tool on the arm: block or sphere.
     trials: int = 5  # Number of trials, each with what the one before has learned.

@@ -18,6 +18,8 @@ from makebreak.systems.contact_mpc.numerics.c3_mpc import C3Bounds, C3Options, C
 
 @dataclass
 class ContactMpcConfig:
+    """What make_contact_mpc plans with: contacts, cost, goal, rates, C3's options."""
+
     contacts: list[ContactPair] = field(default_factory=list)
     # Weights of the state [1/SI^2], (n_x,), and of the input [1/N^2], (n_u,).
     Q: list[float] = field(default_factory=list)

@@ -53,6 +53,8 @@ DOWN = np.array([0.0, 0.0, -1.0])
 
 @dataclass
 class ContactTypesConfig:
+    """Settings of `makebreak run contact_types`."""
+
     seed: int = 0  # Seed of the friction, the station's errors and the noise.
     # Tilt of the block: about one axis on its edge, about two on its corner [deg].
     tilt_deg: float = 10.0

@@ -57,6 +57,8 @@ class PivotStart:
 
 @dataclass
 class PivotPlanner:
+    """Settings of cube_pivoting's planner."""
+
     projection: Literal["plus", "qp"] = "plus"  # Projection of C3: plus or qp.
     options: C3Options = field(
         default_factory=lambda: C3Options(N=10, rounds=3, polish=10)
@@ -93,6 +95,8 @@ def _learner() -> ResidualLearnerConfig:
 
 @dataclass
 class CubePivotingConfig:
+    """Settings of `makebreak run cube_pivoting`."""
+
     seed: int = 0  # Seed of the start and the friction.
     start: PivotStart = field(default_factory=PivotStart)
     mass: float = 0.4  # Mass of the cube in the world [kg].

@@ -207,6 +207,8 @@ def _brisk_ball() -> BallRollingConfig:
 
 @dataclass
 class GentleRollingConfig:
+    """Settings of `makebreak run gentle_rolling`."""
+
     # Whether the second paper's systems lead the tip to the ball; false: as in
     # ball_rolling.
     gentle: bool = True

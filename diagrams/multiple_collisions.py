@@ -87,6 +87,8 @@ APPROACH_SPEED_MAX = 0.03
 
 @dataclass
 class MultipleCollisionsConfig:
+    """Settings of `makebreak run multiple_collisions`."""
+
     # Whether contacts are anticipated and met by transition-phase controllers; false:
     # the base controller alone, at full speed.
     handling: bool = True

@@ -38,6 +38,8 @@ def _model() -> ForceModelConfig:
 
 @dataclass
 class PorridgeConfig:
+    """Settings of `makebreak run porridge`."""
+
     # Seed of the start, the direction, the final viscosity of the test and the noise.
     seed: int = 0
     # Final viscosity in training and in the test; it rises from 0 [N s/m].

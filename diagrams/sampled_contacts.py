@@ -72,6 +72,8 @@ class SampledPlannerConfig:
 
 @dataclass
 class SampledContactsConfig:
+    """Settings of ball_rolling where the planner samples where to touch."""
+
     path: PathTargetConfig = field(default_factory=PathTargetConfig)
     planner: SampledPlannerConfig = field(default_factory=SampledPlannerConfig)
     sampler: ContactSamplerConfig = field(

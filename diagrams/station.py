@@ -72,6 +72,8 @@ class SensorNoise:
 
 @dataclass
 class StationConfig:
+    """A station: its scene, its sensors' noise, its camera."""
+
     scene: str = BALL_ROLLING  # Scene file of the world.
     noise: SensorNoise = field(default_factory=SensorNoise)
     camera: CameraConfig | None = None

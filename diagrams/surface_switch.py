@@ -93,6 +93,8 @@ def _control() -> ChangingContactConfig:
 
 @dataclass
 class SurfaceSwitchConfig:
+    """Settings of `makebreak run surface_switch`."""
+
     # Seed of the frictions, the initial estimates, the station's errors and the noise.
     seed: int = 0
     tool: str = "block"  # Tool on the arm: block or sphere.

@@ -115,6 +115,8 @@ class WallTraining:
 
 @dataclass
 class WallFrictionConfig:
+    """Settings of `makebreak run wall_friction`."""
+
     friction: float = 0.9  # Coefficient of friction of the wall in the tested trials.
     # Stiffness of the impedance controller along each axis [N/m].
     stiffness: float = 300.0

@@ -8,6 +8,7 @@ its surroundings on the way.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -21,8 +22,15 @@ from makebreak.gap.numerics.excitation import (
 from makebreak.models.drives import law_of
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
-from makebreak.models.effects.kind import actuator_of, full_name, one_dof_joints
+from makebreak.models.effects.kind import (
+    actuator_of,
+    full_name,
+    one_dof_joints,
+    sliding_joints,
+    unit_at,
+)
 from makebreak.models.effects.signature import Motion
+from makebreak.models.model_export import models_of
 from makebreak.models.scene import Scene
 from makebreak.models.typed_yaml import nearest
 
@@ -76,6 +84,7 @@ class Predicted:
 
     @property
     def is_told(self) -> bool:
+        """Whether the log will narrow the parameter down."""
         return self.after < UNTOLD * self.before
 
 
@@ -160,6 +169,7 @@ class LogDesign:
         still = np.zeros((1, len(self.joints)))
         motion = Motion(np.zeros(1), still, still, still, still)
         masses, found, prior = self.dynamics.links(), [], []
+        slides = sliding_joints(self.dynamics.plant)
         for kind, at in self.places:
             known = {p.name: p for p in KINDS[kind].parameters}
             for name in self.dynamics.signatures(kind, [at], motion)[0].unknowns:
@@ -170,7 +180,8 @@ class LogDesign:
                 if (kind, at) not in self.named:
                     size = _tolerance(scene, kind, masses[at])
                 prior.append(size)
-                found.append((kind, at, name, _unit(name) if p is None else p.unit))
+                unit = _unit(name) if p is None else unit_at(p.unit, at in slides)
+                found.append((kind, at, name, unit))
         return found, np.array(prior)
 
     def predicted(self, excitation: Excitation) -> tuple[Predicted, ...]:
@@ -246,11 +257,25 @@ def _is_linear(dynamics: SceneDynamics, kind: str, at: str) -> bool:
     return len(signatures) == 1 and not (signatures[0].held or signatures[0].channels)
 
 
+def _effort_limits(scene: Scene) -> dict[str, float]:
+    """{<model>.<joint>: effort limit of its URDF}: Drake keeps none of a joint that has
+    no transmission."""
+    found = {}
+    for model, file in models_of(scene, ".urdf").items():
+        for joint in ElementTree.parse(file).getroot().iter("joint"):
+            for limit in joint.findall("limit"):
+                effort = float(limit.get("effort") or 0.0)
+                if effort > 0.0:  # 0 is where nobody thought of it.
+                    found[f"{model}.{joint.get('name')}"] = effort
+    return found
+
+
 def _limits(scene: Scene, plant, joints, names, plan: LogPlan) -> Limits:
     def given(what: str, k: int, own: float) -> float:
         values = getattr(plan, what)
         return float(values.get(names[k], values.get("", own)))
 
+    of_files = _effort_limits(scene)
     for what in ("velocity", "acceleration", "effort"):
         for name in getattr(plan, what):
             if name and name not in names:
@@ -264,6 +289,7 @@ def _limits(scene: Scene, plant, joints, names, plan: LogPlan) -> Limits:
         actuator, law = actuator_of(plant, joint), law_of(scene.actuation, names[k])
         effort = np.inf if actuator is None else actuator.effort_limit()
         effort = min(effort, np.inf if law is None else float(law.limit))
+        effort = effort if np.isfinite(effort) else of_files.get(names[k], np.inf)
         row = {
             "lower": lower,
             "upper": upper,

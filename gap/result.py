@@ -388,6 +388,7 @@ class GapResult:
         }
 
     def with_seconds(self, seconds: Mapping[str, float]) -> "GapResult":
+        """The result with the times that its stages took [s]."""
         return replace(self, seconds=dict(seconds))
 
 

@@ -58,6 +58,8 @@ BODY_COLOR, PLATE = (0.25, 0.26, 0.28), 1e-3
 
 @dataclass
 class PushedObject:
+    """An object to push, as a model file is made of it."""
+
     # Shape of the object: t, box, l, disc, cylinder (which lies and rolls) or mesh.
     shape: Literal["t", "box", "l", "disc", "cylinder", "mesh"] = "t"
     scale: float = 1.0  # Scale of all dimensions of the object.

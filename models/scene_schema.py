@@ -44,6 +44,8 @@ SIDED = ("position", "velocity", "effort_measured")  # Channels that have a side
 
 @dataclass
 class PlantSection:
+    """A scene's `plant`: time step, contact, gravity."""
+
     time_step: Annotated[float, Between(0.0, 0.1, "s")] = 0.001  # 0 is continuous.
     contact_model: Literal["point", "hydroelastic", "hydroelastic_with_fallback"] = (
         "point"
@@ -104,6 +106,8 @@ class InitialSection:
 
 @dataclass
 class Scene:
+    """A scene file: models, plant, drives, initial state, tolerances, effects."""
+
     packages: dict[str, str] = field(default_factory=dict)  # Name -> its folder.
     directives: list[ModelDirective] = field(default_factory=list)
     plant: PlantSection = field(default_factory=PlantSection)

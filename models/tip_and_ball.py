@@ -33,6 +33,8 @@ UNUSED_FRICTION = CoulombFriction(1.0, 1.0)  # An LCS has the friction of its pa
 
 @dataclass
 class TipAndBall:
+    """The plant of a tip and a ball, for a planner."""
+
     tip_mass: float = 1.0  # [kg]
     tip_radius: float = 0.0195  # [m]
     ball_mass: float = 0.07  # [kg]

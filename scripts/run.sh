@@ -8,8 +8,8 @@ here="$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")"
 "$here/setup.sh"
 
 case "${1:-}" in
-    list | run | station | reproduce | sweep | gap | judge | design-log | inspect | \
-        close-the-loop | export-tests | compile | bench | completion) ;;
+    list | run | station | reproduce | sweep | gap | convert | judge | design-log | \
+        inspect | close-the-loop | export-tests | compile | bench | completion) ;;
     --version | --help | -h) ;;
     *) set -- run "$@" ;;
 esac

@@ -25,6 +25,7 @@ from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.model_export import to_mjcf
 from makebreak.models.scene import ActuationSection
 from makebreak.models.scene_file import write_scene
+from makebreak.models.typed_yaml import read_yaml
 from makebreak.scripts.cli import main
 
 ALL = {"": 4.0}
@@ -172,9 +173,27 @@ def test_the_command_writes_a_table_to_play(tmp_path, capsys):
     # Along its axis, which the centre of mass turns about.
     assert rows["link_com y"] == "not told by efforts"
     assert (tmp_path / "out" / "design.png").is_file()
+    (model,) = read_yaml(tmp_path / "out" / "scene.yaml")["directives"][:1]
+    assert model["add_model"]["file"].startswith("../")  # Both can be moved together.
     log = read_recording(tmp_path / "out" / "design.csv")
     assert len(log.time) == 601
     assert np.abs(log["p.j1.velocity_command"]).max() <= 0.95 * 4.0 + 1e-9
+
+
+@pytest.mark.parametrize("actuator", [True, False])
+def test_limits_are_those_of_the_urdf_with_and_without_a_transmission(
+    tmp_path, actuator
+):
+    limit = '<limit lower="-1" upper="1" effort="9" velocity="4"/>'
+    scene = pendulum(tmp_path, joint=limit, actuator=actuator)
+    plan = replace(PLAN, velocity={}, effort={})
+    limits = LogDesign(scene, ["joint_viscous_damping"], plan).problem.limits
+    share = limits.velocity[0] / 4.0  # A margin is kept of each.
+    assert 0.9 < share <= 1.0
+    assert limits.effort[0] == pytest.approx(9.0 * share)
+    with pytest.raises(ValueError, match=r"no limits of effort \(p.j1\)"):
+        pendulum(tmp_path, joint=limit.replace('"9"', '"0"'), actuator=False)
+        LogDesign(scene, ["joint_viscous_damping"], plan)
 
 
 def test_what_cannot_be_designed_is_one_line(tmp_path):

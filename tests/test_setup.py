@@ -13,6 +13,8 @@ from packaging.markers import Marker
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+from makebreak.scripts.cli.commands import _COMMANDS
+
 ROOT = Path(__file__).resolve().parent.parent
 LOCKS = {"1.51": "requirements.lock", "1.58": "requirements-drake-1.58.lock"}
 
@@ -317,13 +319,9 @@ def test_without_rights_one_command_is_named(checkout):
         ([], ["run"]),
         (["--set", "a=b c"], ["run", "--set", "a=b c"]),
         (["cartpole_walls", "--seed", "3"], ["run", "cartpole_walls", "--seed", "3"]),
-        (["list"], ["list"]),
-        (["bench", "c3"], ["bench", "c3"]),
-        (["close-the-loop"], ["close-the-loop"]),
-        (["compile"], ["compile"]),
-        (["sweep", "x"], ["sweep", "x"]),
         (["--version"], ["--version"]),
         (["run", "ball_rolling"], ["run", "ball_rolling"]),
+        *(([name, "x"], [name, "x"]) for name in _COMMANDS),
     ],
 )
 def test_run_passes_its_arguments_and_keeps_the_folder(checkout, given, passed):

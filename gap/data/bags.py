@@ -28,10 +28,12 @@ CLOCKS_APART = 1.0
 
 
 def is_bag(path: Path) -> bool:
+    """Whether it is a ROS bag or an MCAP file."""
     return path.suffix.lower() in BAGS or (path / "metadata.yaml").is_file()
 
 
 def is_dataset(path: Path) -> bool:
+    """Whether it is a LeRobot dataset."""
     return (path / "meta" / "info.json").is_file()
 
 

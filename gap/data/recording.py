@@ -58,14 +58,17 @@ class Channel:
 
     @property
     def model(self) -> str:
+        """The first word of the name."""
         return self.name.split(".")[0]
 
     @property
     def element(self) -> str:
+        """The joint, body or frame."""
         return self.name.split(".", 1)[1].rsplit(".", 1)[0]
 
     @property
     def quantity(self) -> str:
+        """The last word of the name."""
         return self.name.rsplit(".", 1)[1]
 
     @property
@@ -75,6 +78,7 @@ class Channel:
 
     @property
     def is_command(self) -> bool:
+        """Whether it was commanded, not measured."""
         return self.quantity in COMMANDS
 
 
@@ -107,6 +111,7 @@ class Episode:
 
     @property
     def rows(self) -> slice:
+        """The episode's rows, as a slice."""
         return slice(self.first, self.last)
 
     @property
@@ -146,9 +151,11 @@ class Recording:
         return self.channels[name].values
 
     def commands(self) -> list[Channel]:
+        """The channels that were commanded."""
         return [c for c in self.channels.values() if c.is_command]
 
     def measured(self) -> list[Channel]:
+        """The channels that were measured."""
         return [c for c in self.channels.values() if not c.is_command]
 
     def places(self, quantities: Iterable[str] = QUANTITIES) -> list[str]:

@@ -16,7 +16,7 @@ from makebreak.gap.data.table import write_recording
 from makebreak.gap.design import DesignedLog, LogDesign, LogPlan
 from makebreak.models.scene import Scene, read_scene
 from makebreak.scripts.cli.arguments import number
-from makebreak.scripts.cli.gap_command import StageBar
+from makebreak.scripts.cli.gap_command import StageBar, name_from
 from makebreak.scripts.runner.outputs import OutputFolder
 from makebreak.scripts.runner.table import Table, json_value
 
@@ -59,13 +59,16 @@ def design_log(
         ]
         text = json.dumps({"parameters": told}, indent=2)
         out.file("result.json").write_text(text + "\n")
+        if robot:
+            name_from(out_dir, scene_path, out.file("scene.yaml"))
         return table, out.commit()
 
 
 def _scene_of_robot(path: Path, file: Path) -> Scene:
     """The robot upright on the world, its joints driven by efforts."""
     robot = read_robot(path)
-    lines = [f"- add_model: {{name: {robot.model}, file: file://{path.resolve()}}}"]
+    uri = json.dumps(f"file://{path.resolve()}")
+    lines = [f"- add_model: {{name: {robot.model}, file: {uri}}}"]
     for base in robot.bases:
         lines.append(f"- add_weld: {{parent: world, child: {robot.model}::{base}}}")
     joints = ", ".join(joint.name for joint in robot.joints)

@@ -55,6 +55,8 @@ BEHIND_SEC = 0.05  # Lag behind its clock that is made up for; more is dropped [
 
 @dataclass
 class StandInConfig:
+    """How the stand-in of a robot runs and what its network does."""
+
     rate: float = 1.0  # Simulated seconds per second, at most 1.
     drop: float = 0.0  # Probability that a message is lost, in both directions.
     delay_sec: float = 0.0  # Delay of the messages it sends, on its own clock.

@@ -29,6 +29,8 @@ from makebreak.systems.numerics.timing import timed
 
 @dataclass
 class ArmReferenceConfig:
+    """Settings of ArmReference: limits of what is asked of the arm."""
+
     # Mass of the tip in the LCS, by which lam is turned into a force [kg].
     tip_mass: float = 1.0
     force_max: float = 3.0  # Largest feed-forward force [N].

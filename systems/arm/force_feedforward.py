@@ -11,6 +11,8 @@ from makebreak.systems.numerics.timing import timed
 
 @dataclass
 class ForceFeedforwardConfig:
+    """Settings of ForceFeedforward."""
+
     filter_sec: float = 0.02  # Of a first-order filter.
     force_max: float = 20.0  # Of what is fed forward [N].
     period_sec: float = 0.001

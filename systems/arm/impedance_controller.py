@@ -31,6 +31,8 @@ DELAY_DAMPING_MAX = 0.5
 
 @dataclass
 class ImpedanceConfig:
+    """Settings of ImpedanceController: stiffness, damping, limits, posture."""
+
     # Stiffness along x, y, z [N/m] and about x, y, z [N m/rad]; not used where a
     # variable impedance is connected.
     stiffness: list[float] = field(default_factory=lambda: [1000.0] * 3 + [50.0] * 3)

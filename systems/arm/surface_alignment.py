@@ -20,6 +20,8 @@ from makebreak.systems.numerics.timing import timed
 
 @dataclass
 class SurfaceAlignmentConfig:
+    """Settings of SurfaceAlignment."""
+
     # Largest angle by which the tool is turned beyond its planned orientation, to lie
     # flat on a surface; 0: it is not turned [deg].
     angle_max_deg: float = 0.0

@@ -51,6 +51,8 @@ class TrustConfig:
 
 @dataclass
 class VariableImpedanceConfig:
+    """Settings of VariableImpedance: how stiffness follows the tracking error."""
+
     stiffness: StiffnessConfig = field(default_factory=StiffnessConfig)
     trust: TrustConfig = field(default_factory=TrustConfig)
     # Time T of the blend between base and transition-phase controller (CC eq. 10) [s].

@@ -24,6 +24,8 @@ from makebreak.systems.numerics.timing import timed
 
 @dataclass
 class WrenchTareConfig:
+    """Settings of WrenchTare."""
+
     # Largest force that is taken for the sensor's bias; a larger one before the first
     # tare is a contact [N]; 0: no taring.
     bias_max: float = 3.0

@@ -14,6 +14,8 @@ HELD, AT_LIMIT = 1, 2  # Bits of the status.
 
 @dataclass
 class ActiveInferenceConfig:
+    """Settings of the baseline active inference."""
+
     # Variances of measured position, of measured velocity, of the belief and of its
     # rate.
     variance: list[float] = field(default_factory=lambda: [1.0, 1.0, 5.0, 5.0])

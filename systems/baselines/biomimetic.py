@@ -19,6 +19,8 @@ HELD, AT_LIMIT = 1, 2  # Bits of the status.
 
 @dataclass
 class BiomimeticConfig:
+    """Settings of the baseline biomimetic adaptive control."""
+
     kappa: float = 10.0  # Weight kappa of the position error in eps [1/s].
     # Learning rates Q_F [N s/m], Q_K [N s/m2] and Q_D [N s2/m2] of force, stiffness and
     # damping.

@@ -27,11 +27,15 @@ class DynamicsStatus(IntEnum):
 
 @dataclass
 class DynamicsResidualLearnerConfig:
+    """Settings of the baseline that learns a residual of the dynamics."""
+
     n_b: int = 10  # Measured steps in the buffer.
 
 
 @dataclass(frozen=True, eq=False)
 class DynamicsMemory:
+    """What the learner remembers between updates."""
+
     sample: tuple[np.ndarray, LCS] | None  # x_k and the LCS at x_k.
     errors: np.ndarray  # (n, n_x), read-only.
     status: DynamicsStatus

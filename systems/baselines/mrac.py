@@ -14,6 +14,8 @@ HELD, AT_LIMIT = 1, 2  # Bits of the status.
 
 @dataclass
 class MracConfig:
+    """Settings of the baseline MRAC (model reference adaptive control)."""
+
     omega: float = 1.5  # Natural frequency of the reference model [1/s].
     zeta: float = 1.0  # Damping ratio of the reference model.
     rate_weight: float = 1.0  # Weight l of the velocity error [s2].

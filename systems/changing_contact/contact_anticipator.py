@@ -85,6 +85,8 @@ class ContactFilterConfig:
 
 @dataclass
 class ApproachSpeedConfig:
+    """How fast a contact is approached, and how that is learned from impacts."""
+
     # Desired peak force F_d of an impact, along the motion [N].
     force_desired: float = 8.0
     # Approach speed v_a of a contact that has not been felt, if stiffness_most is 0
@@ -124,6 +126,8 @@ class ApproachSpeedConfig:
 
 @dataclass
 class ContactAnticipatorConfig:
+    """Settings of KalmanContactAnticipator."""
+
     filter: ContactFilterConfig = field(default_factory=ContactFilterConfig)
     speed: ApproachSpeedConfig = field(default_factory=ApproachSpeedConfig)
     # Time before its expected place at which a mode is announced [s].

@@ -20,6 +20,8 @@ from makebreak.systems.numerics.timing import timed
 
 @dataclass
 class ContactDetectorConfig:
+    """Settings of ContactDetector: forces at which contact is made and broken."""
+
     # Force beyond the expected friction that may be an impact [N].
     impact_force: float = 2.0
     loss_force: float = 1.0  # Normal force below which there is no contact [N].

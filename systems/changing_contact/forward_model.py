@@ -51,6 +51,8 @@ class HandoverConfig:
 
 @dataclass
 class ForwardModelConfig:
+    """Settings of ForwardModelBank."""
+
     # Whether the models have |w| and |tau| too; false: |v| and |F_t| alone.
     with_torque: bool = True
     # Whether the models learn; false: they stay as they are given, the fixed GMM.

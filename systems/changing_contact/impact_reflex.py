@@ -19,6 +19,8 @@ from makebreak.systems.numerics.timing import timed
 
 @dataclass
 class ImpactReflexConfig:
+    """Settings of ImpactReflex."""
+
     # Braking force over the force that is felt beyond force_least; 0: no reflex.
     gain: float = 0.0
     # Force beyond friction below which what is felt is noise [N].

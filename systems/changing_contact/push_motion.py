@@ -37,6 +37,8 @@ NEAR = 0.005  # Farther apart tip and ball, as modelled, do not touch [m].
 
 @dataclass
 class PushMotionConfig:
+    """Settings of PushMotion."""
+
     shape: PushConfig = field(default_factory=PushConfig)
     # Number of the first reposition on which the table is touched.
     table_first: int = 3

@@ -30,6 +30,8 @@ SPEED_MIN = 1e-3  # [m/s] A slower reference has no direction.
 
 @dataclass
 class ReferenceBlendConfig:
+    """Settings of ReferenceBlend."""
+
     # Time of a blend between the planner's and the shaper's reference [s].
     blend_sec: float = 0.1
     damping: float = 400.0  # Damping of the arm's tip [N s/m].

@@ -37,6 +37,8 @@ from makebreak.systems.numerics.timing import timed
 
 @dataclass
 class RegionConfig:
+    """Where an expected contact is approached slowly."""
+
     # Half width of the region of an expected contact, in standard deviations of its
     # place.
     sigmas: float = 2.0
@@ -54,6 +56,8 @@ class RegionConfig:
 
 @dataclass
 class SearchConfig:
+    """What is done where an expected contact does not come."""
+
     # Speed of the search for a contact beyond the end of the path, where none was
     # expected [m/s].
     speed: float = 0.05
@@ -65,6 +69,8 @@ class SearchConfig:
 
 @dataclass
 class VelocityShaperConfig:
+    """Settings of VelocityShaper."""
+
     # Largest acceleration along the path in a change of speed [m/s2].
     acceleration_max: float = 0.9
     speed_min: float = 0.004  # Least approach speed; a lower one is raised to it [m/s].

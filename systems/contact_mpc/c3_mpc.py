@@ -52,6 +52,8 @@ class C3Status(IntEnum):
 
 @dataclass
 class C3Config:
+    """What C3Mpc plans with: cost, projection, options, bounds."""
+
     weights: C3Weights = field(default_factory=C3Weights)  # Must be given.
     # In YAML `projection: !PlusProjection {}`, `!QpProjection {alpha: 0.01}`,
     # `!ExactProjection {}`.

@@ -49,6 +49,8 @@ class Model(Protocol):
 
 @dataclass
 class ContactSamplerConfig:
+    """Settings of ContactSampler."""
+
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     # Radius at which an angle to the goal counts as the distance of its arc [m]; the
     # diagram sets it.

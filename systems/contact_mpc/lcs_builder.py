@@ -35,6 +35,8 @@ __all__ = [
 
 @dataclass
 class LcsBuilderConfig:
+    """Settings of AnitescuLcsBuilder: contacts, time step, rate."""
+
     contacts: list[ContactPair] = field(default_factory=list)
     dt_sec: float = 0.1  # Time step of the LCS [s].
     eps_c: float | None = None  # [m/s per N]; None: 0.01 dt_sec.

@@ -11,6 +11,8 @@ from makebreak.systems.numerics.timing import timed
 
 @dataclass
 class LcsPlantConfig:
+    """Settings of LcsPlant."""
+
     period_sec: float | None = None  # None: the LCS's own time step [s].
     offset_sec: float = 0.0  # Of the first step [s].
 

@@ -51,6 +51,8 @@ class ParameterStatus(IntEnum):
 
 @dataclass
 class ParameterLearnerConfig:
+    """Settings of ParameterLearner: what is learned, from what, trusted how far."""
+
     contacts: list[ContactPair] = field(default_factory=list)
     parameters: list[Parameter] = field(default_factory=list)
     # Inverse variances (n_x,) of the one-step errors [1/SI^2]; empty: 1e4 for each

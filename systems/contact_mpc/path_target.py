@@ -24,6 +24,8 @@ AWAY = 0.001  # Distance of the tip's target from the ball, so that it is no pus
 
 @dataclass
 class PathTargetConfig:
+    """Settings of PathTarget."""
+
     # Centre of the circle along which the ball is rolled, [x, y] [m]; the diagram sets
     # it.
     center: list[float] = field(default_factory=lambda: [0.5, 0.0])

@@ -16,6 +16,8 @@ from makebreak.systems.numerics.settings import check_settings
 
 @dataclass
 class PivotTargetConfig:
+    """Settings of PivotTarget."""
+
     side: float = 0.1  # Of the cube [m].
     finger_radius: float = 0.012  # [m]
     goal: float = np.pi / 2  # Angle of the cube [rad].

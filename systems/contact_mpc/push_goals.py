@@ -17,6 +17,8 @@ from makebreak.systems.numerics.timing import timed
 
 @dataclass
 class PushGoalsConfig:
+    """Settings of PushGoals: where goals are, and when one is reached."""
+
     # Centre of the rectangle from which goals are drawn, [x, y] [m]; yaw is drawn from
     # the whole circle.
     center: list[float] = field(default_factory=lambda: [0.5, 0.0])

@@ -22,6 +22,8 @@ from makebreak.systems.numerics.timing import timed
 
 @dataclass
 class PushTaskConfig:
+    """Settings of PushTask."""
+
     push: PushConfig = field(default_factory=PushConfig)
     # Height of the tip's centre while it pushes [m]; the diagram sets it.
     height: float = 0.024

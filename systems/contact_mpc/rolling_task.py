@@ -36,6 +36,8 @@ UPHILL = 0.25
 
 @dataclass
 class RollingTaskConfig:
+    """Settings of RollingTask: the circle, the goal ahead of the ball, the rolling."""
+
     # Centre of the circle along which the ball is rolled, [x, y] [m].
     center: list[float] = field(default_factory=lambda: [0.5, 0.0])
     radius: float = 0.1  # Radius of the circle [m].

@@ -12,6 +12,8 @@ ROUNDING = 1e-9  # Tolerance: reaching a limit is no violation.
 
 @dataclass
 class ArmLimits:
+    """An arm's limits of position, velocity, effort and its rate."""
+
     torque: np.ndarray  # (n,) [N m]
     torque_rate: float  # [N m/s]
     speed: np.ndarray  # (n,) [rad/s]

@@ -36,6 +36,8 @@ _PER_MODEL = 4 + 3 + 1
 
 @dataclass
 class BallTrackerConfig:
+    """Settings of BallTracker: the ball, the colour, the noises of the filter."""
+
     # Radius of the ball in the model [m]; the diagram sets it.
     ball_radius: float = 0.0315
     table_z: float = 0.0  # Height of the table [m].

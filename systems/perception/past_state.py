@@ -22,6 +22,8 @@ from makebreak.systems.perception.numerics.pose_filter import on_the_table
 
 @dataclass
 class PastStateConfig:
+    """Settings of PastState."""
+
     ticks: int = 4  # How many periods ago.
     half_width: float = 0.1  # Readings within this time before and after are used [s].
     height: float = 0.02  # Of the object's origin on the table [m].

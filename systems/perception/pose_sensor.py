@@ -25,6 +25,8 @@ KEPT_SEC = 1.0  # Age up to which readings are kept.
 
 @dataclass
 class PoseSensorConfig:
+    """Settings of PoseSensor: noise, delay, rate, and the noises of the filter."""
+
     # Standard deviations of the measured position [m] and orientation [rad], each axis.
     noise: list[float] = field(default_factory=lambda: [1e-3, 1e-2])
     # Delay of a reading from its measurement to its arrival [s].

@@ -37,6 +37,8 @@ _READ, _READ_AT, _SIZE = slice(15, 18), 18, 19
 
 @dataclass
 class PoseTrackerConfig:
+    """Settings of PoseTracker: the colour, the noises of the filter."""
+
     z: float = 0.02  # Height of the object's frame [m]; the diagram sets it.
     # Hue of the object's colour [rad]: 0 red, 2.09 green, 4.19 blue; the diagram sets
     # it.

@@ -22,6 +22,8 @@ from makebreak.systems.perception.numerics.state_estimator import (
 
 @dataclass
 class StateEstimatorConfig:
+    """Settings of StateEstimator."""
+
     ball_radius: float = 0.0315  # Of the model [m].
     tip_mass: float = 1.0  # Of the tip in the LCS [kg].
     window_sec: float = 0.05  # Over which the force is averaged: the learner's period.

@@ -31,6 +31,8 @@ HELD, AT_LIMIT, NO_MODEL = 1, 2, 4  # Status, a sum.
 
 @dataclass
 class PlanarImpedanceConfig:
+    """Settings of PlanarImpedance."""
+
     # K_free of eq. 4b: stiffness where the force model predicts well [N/m].
     stiffness_free: float = 50.0
     # K_max of eq. 4b: stiffness where the force model predicts badly [N/m].
@@ -53,6 +55,8 @@ def _default_model() -> IgmmConfig:
 
 @dataclass
 class ForceModelConfig:
+    """Settings of the model that predicts the force in the plane."""
+
     # Mixture over [v 2, F 2, next F 2]; with `position` over [p 2, v 2, F 2, next F 2];
     # with `along_motion` over [|v|, f, next f].
     mixture: IgmmConfig = field(default_factory=_default_model)

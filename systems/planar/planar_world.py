@@ -16,6 +16,8 @@ from makebreak.systems.planar.numerics.planar_world import (
 
 @dataclass
 class PlanarWorldConfig:
+    """A point in the plane, and the springs or the porridge that it meets."""
+
     mass: float = 1.0  # [kg]
     # Initial and final viscosity [N s/m]; it rises over ramp_sec, from time 0 on.
     viscosity: list[float] = field(default_factory=lambda: [0.0, 0.0])
@@ -129,6 +131,8 @@ class PlanarWorld(LeafSystem):
 
 @dataclass
 class CircleTargetConfig:
+    """The circle that a point is to follow."""
+
     radius: float = 0.25  # [m]
     duration_sec: float = 6.0
     phase: float = 0.0  # Angle at which it starts [rad].

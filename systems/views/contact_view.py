@@ -44,6 +44,8 @@ FORCE_SLIDER, SPEED_SLIDER = "force [N]", "speed [mm/s]"  # Longer ones are cut 
 
 @dataclass
 class ContactViewConfig:
+    """Settings of ContactView."""
+
     sigmas: float = 2.0  # Half axes of the regions, in standard deviations.
     force_scale: float = 0.012  # Length of the arrow [m/N].
     # Peak forces of earlier trials, one list per trial [N]: a group of bars each.

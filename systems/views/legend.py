@@ -21,6 +21,8 @@ _CORNER, _LINE = _AWAY * np.array([-0.75, 0.62, 1.0]), _AWAY * 0.04
 
 @dataclass
 class LegendConfig:
+    """Settings of Legend."""
+
     lines: Sequence[tuple[str, Rgba]] = ()  # Text, and the colour that it explains.
     phases: Sequence[str] = ()  # Text of each value of the phase.
     camera: Sequence[float] = (1.0, -0.6, 0.5)  # Position of the view's camera [m].

@@ -17,6 +17,8 @@ _SPRING = Rgba(0.4, 0.4, 0.4)
 
 @dataclass
 class PlanarViewConfig:
+    """Settings of PlanarView."""
+
     anchors: list[list[float]] = field(default_factory=list)  # Of the springs [m].
     stiffness: list[float] = field(default_factory=list)  # One per anchor [N/m].
     # Initial and final viscosity [N s/m], shown as a bar that grows over ramp_sec.

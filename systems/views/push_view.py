@@ -19,6 +19,8 @@ _TRACK = Rgba(0.65, 0.25, 0.75)
 
 @dataclass
 class PushViewConfig:
+    """Settings of PushView."""
+
     height: float = 0.02  # Of the object's frame on the table [m].
     track_m: float = 0.003  # Least distance between points of the track [m].
     period_sec: float = 1.0 / 15.0

@@ -18,6 +18,8 @@ _MODEL, _RESIDUAL = Rgba(0.3, 0.5, 1.0, 0.25), Rgba(0.2, 0.45, 1.0)
 
 @dataclass
 class RollingViewConfig:
+    """Settings of RollingView."""
+
     center: list[float] = field(default_factory=lambda: [0.5, 0.0])  # [m]
     radius: float = 0.1  # Of the path [m].
     ball_radius: float = 0.0315  # Of the model [m].

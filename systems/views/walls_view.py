@@ -12,6 +12,8 @@ _WALL = Rgba(0.2, 0.45, 1.0, 0.4)
 
 @dataclass
 class WallsViewConfig:
+    """Settings of WallsView."""
+
     # Modelled distances of the walls at +x and at -x from the middle, for the tip's
     # centre [m].
     gap: list[float] = field(default_factory=lambda: [0.35, 0.35])

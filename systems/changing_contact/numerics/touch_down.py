@@ -34,6 +34,8 @@ GATE = 4.0
 
 @dataclass
 class TouchDownConfig:
+    """How fast a tip comes down, and what it learns from each touch."""
+
     # Desired peak force of a touch, as the arm feels it [N].
     force_desired: float = 8.0
     # Speed in the region of anticipated contact before any touch was felt [m/s].

@@ -93,6 +93,8 @@ class C3Weights:
 
 @dataclass
 class C3Options:
+    """Horizon, rounds and penalties of C3."""
+
     N: int = 5  # Number of knots of the plan, each a time step of the LCS long.
     rounds: int = 3  # Number of ADMM rounds.
     # Factor by which the consensus weights G grow from round to round, at least 1.
@@ -260,6 +262,7 @@ class C3Problem:
         return Q, Q_N, goal
 
     def cold_start(self) -> WarmStart:
+        """What a first plan starts from: zeros."""
         N = self.options.N
         z = np.zeros((N, self.n_z))
         return WarmStart(np.zeros((N, self.n_u)), z, z)

@@ -60,14 +60,17 @@ class LCS:
 
     @property
     def n_x(self) -> int:
+        """Length of the state."""
         return self.D.shape[0]
 
     @property
     def n_u(self) -> int:
+        """Length of the input."""
         return self.B.shape[1]
 
     @property
     def n_lam(self) -> int:
+        """Number of contact forces."""
         return self.D.shape[1]
 
     def with_residual(self, r_comp) -> "LCS":

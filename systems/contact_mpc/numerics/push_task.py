@@ -45,6 +45,8 @@ TAKEN_BACK = 0.001
 
 @dataclass
 class PushConfig:
+    """How a tip goes about an object and pushes it."""
+
     speed: float = 0.35  # Largest speed of the tip as it travels [m/s].
     acceleration: float = 2.0  # Largest acceleration of the tip as it travels [m/s2].
     # Largest speed of the tip as it comes down beside the object [m/s].
