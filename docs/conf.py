@@ -15,6 +15,8 @@ from textwrap import dedent, indent
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
+from docutils import nodes  # noqa: E402
+
 import makebreak  # noqa: E402
 from makebreak.scripts.cli.settings_list import comments_of  # noqa: E402
 
@@ -39,6 +41,7 @@ sphinx_gallery_conf = {
     "min_reported_time": 3600,
     "abort_on_example_error": True,
 }
+_AS_THEY_ARE = (nodes.literal, nodes.literal_block, nodes.title, nodes.abbreviation)
 _FIELDS = "Inputs|Outputs|Args|Attributes|Returns|Raises|Source"
 
 
@@ -96,6 +99,25 @@ def _escaped(text: str) -> str:
     return "".join(a + b for a, b in zip(plain, [*code, ""], strict=True)).strip()
 
 
+def on_resolved(app, tree, page):
+    """The first use of a term of terms.md says what it is where the pointer rests."""
+    if page == "terms":
+        return
+    table = (ROOT / "docs" / "terms.md").read_text()
+    rows = re.findall(r"^\| ([A-Z][\w-]*) \| ([^|]*) \|", table, re.M)
+    for term, meaning in sorted(rows, key=lambda row: -len(row[0])):
+        for text in list(tree.findall(nodes.Text)):
+            if isinstance(text.parent, _AS_THEY_ARE):
+                continue
+            parts = re.split(rf"(?<![\w/-]){term}(?![\w-])", text.astext(), maxsplit=1)
+            if len(parts) > 1:
+                explained = nodes.abbreviation(term, term, explanation=meaning)
+                new = [nodes.Text(parts[0]), explained, nodes.Text(parts[1])]
+                text.parent.replace(text, new)
+                break
+
+
 def setup(app):
+    app.connect("doctree-resolved", on_resolved)
     app.connect("source-read", on_reading)
     app.connect("autodoc-process-docstring", on_docstring)

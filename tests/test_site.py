@@ -48,6 +48,23 @@ def test_the_site_has_every_page_and_name_and_needs_no_network(tmp_path):
     for module in (makebreak, makebreak.gap):
         for name in module.__all__:
             assert f'id="{module.__name__}.{name}"' in reference, name
+    terms = re.findall(
+        r"^\| ([A-Z][\w-]*) \| ([^|]*) \|", (DOCS / "terms.md").read_text(), re.M
+    )
+    assert len(terms) > 10
+    for page in [p for p in pages - {"terms"} if (site / f"{p}.html").is_file()]:
+        body = re.search(
+            r"<article[\s\S]*?</article>", (site / f"{page}.html").read_text()
+        )[0]
+        body = re.sub(r"<(pre|code|h\d|title)\b[\s\S]*?</\1>", "", body)
+        plain = re.sub(r"<abbr[\s\S]*?</abbr>", "", body)
+        for term, meaning in terms:
+            said = f'<abbr title="{meaning}">{term}</abbr>'
+            used = re.search(rf">[^<]*(?<![\w/-]){term}(?![\w-])", plain)
+            assert body.count(said) == 1 if used else body.count(said) <= 1, (
+                page,
+                term,
+            )
     for page in site.rglob("*.html"):
         loaded = re.findall(
             r'<(?:script|link|img)[^>]*(?:src|href)="(.*?)"', page.read_text()
