@@ -36,7 +36,7 @@ from makebreak.systems.arm.numerics.impedance_controller import (
     force_control,
     impedance_torque,
     memory_size,
-    packed_tick,
+    tick,
 )
 from makebreak.systems.arm.numerics.packed import packed
 from makebreak.systems.arm.numerics.serial_chain import chain_state
@@ -532,7 +532,7 @@ def test_damping_rule_is_the_critical_one_times_its_ratio(law, chain, ratio):
 def run_ticks(chain, law, n, state, directions, targets, measured=None):
     tau, memory = state
     for _ in range(n):
-        tau, status, memory = packed_tick(
+        tau, status, memory = tick(
             packed(chain), packed(law), tau, memory,
             law.q_nominal, np.zeros(7), reference(), law.stiffness, law.damping, 0.0,
             np.zeros(6), directions, targets,

@@ -669,7 +669,7 @@ ALTERED = {
             plain(table, law._replace(acceleration_max=5.005), *a)),
     ),
     "impedance_controller": (
-        impedance_controller, "packed_tick", lambda plain: lambda *a: (
+        impedance_controller, "tick", lambda plain: lambda *a: (
             plain(*a[:7], 1.001 * a[7], *a[8:])),
     ),
 }  # fmt: skip

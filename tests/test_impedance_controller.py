@@ -37,10 +37,10 @@ from makebreak.systems.arm.numerics.impedance_controller import (
     SLOT,
     impedance_torque,
     memory_size,
-    packed_tick,
     quaternion_of,
     rotation_error,
     rotation_of,
+    tick,
 )
 from makebreak.systems.arm.numerics.joint_limits import (
     EFFORT_LIMITED,
@@ -286,7 +286,7 @@ def run_ticks(chain, law, inputs):
     memory, rows = np.zeros(memory_size(7)), []
     for q, v, x_d, *rest in inputs:
         K, D, wrench = (*rest, *(law.stiffness, law.damping, np.zeros(6))[len(rest) :])
-        tau, status, memory = packed_tick(
+        tau, status, memory = tick(
             packed(chain),
             packed(law),
             tau,
@@ -346,8 +346,8 @@ def test_a_delay_that_is_no_time_counts_as_none_and_is_said(law, chain, delay):
     gains = law.stiffness, law.damping, 0.0, np.zeros(6)
     start = chain_state(chain, q, v).bias, np.zeros(memory_size(7)), q, v, reference()
     *others, none = NO_FORCE
-    tau, status, _ = packed_tick(*args, *start, *gains, *others, delay)
-    without, status_without, _ = packed_tick(*args, *start, *gains, *others, none)
+    tau, status, _ = tick(*args, *start, *gains, *others, delay)
+    without, status_without, _ = tick(*args, *start, *gains, *others, none)
     assert status_without & JOINT_BRAKED
     assert status == status_without | REFERENCE_HELD
     np.testing.assert_array_equal(tau, without)
@@ -395,7 +395,7 @@ def coast(law, chain, which, joints, t_nan=0.1, t_end=0.4):
             if "v" in which:
                 v_read[joints] = np.nan
         x_d = reference(P_TIP + k * dt * v_d, v_d)
-        tau, status, memory = packed_tick(
+        tau, status, memory = tick(
             packed(chain), packed(law), tau, memory, q_read, v_read, x_d,
             law.stiffness, law.damping, 0.0, np.zeros(6), *NO_FORCE,
         )  # fmt: skip

@@ -13,7 +13,7 @@ from makebreak.systems.arm.impedance_controller import (
 )
 from makebreak.systems.arm.numerics.impedance_controller import (
     memory_size,
-    packed_tick,
+    tick,
 )
 from makebreak.systems.arm.numerics.joint_limits import (
     FREE_SHARE,
@@ -120,7 +120,7 @@ def arm_run(law, reference, seconds, rng, motor=None, push=None):
         read_q, read_v = q + 1e-5 * rng.normal(size=7), v + 1e-3 * rng.normal(size=7)
         x_d = np.zeros(19)
         x_d[:3], x_d[3] = reference(k * TICK), 1.0
-        tau, status, memory = packed_tick(
+        tau, status, memory = tick(
             PACKED_CHAIN, PACKED_LAW, tau, memory, read_q, read_v, x_d, law.stiffness,
             law.damping, 0.0, np.zeros(6), np.zeros(6), np.zeros(2), np.zeros(6), 0.0,
         )  # fmt: skip

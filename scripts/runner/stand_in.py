@@ -44,7 +44,6 @@ from makebreak.diagrams.station import (
 )
 from makebreak.systems.arm.gravity_left_out import gravity_torque
 from makebreak.systems.arm.impedance_controller import serial_chain_of
-from makebreak.systems.arm.numerics.packed import packed
 
 TICK = 0.001  # [s]
 EXPIRE_SEC = 0.1
@@ -168,7 +167,7 @@ class StandIn:
         self._in = self._station.GetInputPort(f"{ARM}.torque_commanded")
         self._in.FixValue(self._context, np.zeros(N_JOINTS))
         arm = make_control_plant(world.world)
-        self._chain = packed(serial_chain_of(arm, TIP_FRAME))
+        self._chain = serial_chain_of(arm, TIP_FRAME)
         self._speed_max = arm.GetVelocityUpperLimits()
         plant = self._station.GetSubsystemByName("plant")
         self._robot = plant.GetModelInstanceByName(ARM)

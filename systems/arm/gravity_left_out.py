@@ -3,16 +3,15 @@
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from makebreak.systems.arm.numerics.packed import packed
 from makebreak.systems.arm.numerics.serial_chain import SerialChain, chain_state
 
 
-def gravity_torque(chain, q) -> np.ndarray:
+def gravity_torque(chain: SerialChain, q) -> np.ndarray:
     """Torques (n,) [N m] that hold the arm at rest against gravity.
 
-    Args: chain: packed SerialChain; q (n,) [rad].
+    Args: chain: of the arm with its tool; q (n,) [rad].
     """
-    return chain_state(chain[0], q, np.zeros(len(q))).bias
+    return chain_state(chain, q, np.zeros(len(q))).bias
 
 
 class GravityLeftOut(LeafSystem):
@@ -26,7 +25,7 @@ class GravityLeftOut(LeafSystem):
     def __init__(self, chain: SerialChain):
         super().__init__()
         n = len(chain.mass)
-        self._chain = packed(chain)
+        self._chain = chain
         self._tau = self.DeclareVectorInputPort("tau", n)
         self._q = self.DeclareVectorInputPort("q", n)
         self._last = self.DeclareDiscreteState(np.full(n, np.nan))

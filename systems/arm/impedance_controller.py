@@ -13,7 +13,7 @@ from makebreak.systems.arm.numerics.impedance_controller import (
     ForceLaw,
     Law,
     memory_size,
-    packed_tick,
+    tick,
     warm_up,
 )
 from makebreak.systems.arm.numerics.joint_friction import NO_LAWS
@@ -208,7 +208,7 @@ class ImpedanceController(LeafSystem):
         )
         self._ratio = float(hybrid.damping_ratio)
         self._packed = packed(self._chain), packed(self._law)
-        first_call(warm_up, *self._packed)
+        first_call(warm_up, *self._packed, n)
         self._q = self.DeclareVectorInputPort("q", n)
         self._v = self.DeclareVectorInputPort("v", n)
         self._x_desired = self.DeclareVectorInputPort("x_desired", 19)
@@ -220,12 +220,12 @@ class ImpedanceController(LeafSystem):
         self._measured = self.DeclareVectorInputPort("wrench_measured", 6)
         self._damped = self.DeclareVectorInputPort("damping_stiffness", 6)
         self._delay = self.DeclareVectorInputPort("delay", 1)
-        at_rest = chain_state(self._packed[0][0], q_nominal, np.zeros(n))
+        at_rest = chain_state(self._chain, q_nominal, np.zeros(n))
         mobility = at_rest.J[:3] @ np.linalg.solve(at_rest.M, at_rest.J[:3].T)
         with np.errstate(divide="ignore"):  # Infinite where the arm cannot move it.
             self._mass = 1.0 / np.diag(mobility)  # Of the tip along each axis [kg].
         # The initial torque carries the arm at its nominal position.
-        carrying = chain_state(self._packed[0][0], q_nominal, np.zeros(n)).bias
+        carrying = chain_state(self._chain, q_nominal, np.zeros(n)).bias
         self._tau = self.DeclareDiscreteState(carrying)
         self._status = self.DeclareDiscreteState(1)
         self._memory = self.DeclareDiscreteState(memory_size(n))
@@ -242,7 +242,7 @@ class ImpedanceController(LeafSystem):
         q (n,) [rad], and an empty memory."""
         n = self._tau_size
         q = np.array(q, dtype=float)
-        carrying = chain_state(self._packed[0][0], q, np.zeros(n)).bias
+        carrying = chain_state(self._chain, q, np.zeros(n)).bias
         context.SetDiscreteState(self._tau, carrying)
         context.SetDiscreteState(self._memory, np.zeros(memory_size(n)))
 
@@ -269,10 +269,10 @@ class ImpedanceController(LeafSystem):
             directions = self._directions.Eval(context)
             targets = self._or(self._targets, context, self._no_targets)
             measured = self._or(self._measured, context, self._no_wrench)
-        tau, status, memory = packed_tick(
+        tau, status, memory = tick(
             *self._packed,
-            context.get_discrete_state(self._tau).value(),
-            context.get_discrete_state(self._memory).value(),
+            np.array(context.get_discrete_state(self._tau).value()),
+            np.array(context.get_discrete_state(self._memory).value()),
             self._q.Eval(context),
             self._v.Eval(context),
             self._x_desired.Eval(context),
@@ -369,7 +369,7 @@ def serial_chain_of(plant: MultibodyPlant, tip_frame: str) -> SerialChain:
     return SerialChain(
         R_PJ=np.array(R_PJ),
         p_PJ=np.array(p_PJ),
-        slides=np.array([int(isinstance(j, PrismaticJoint)) for j in moving]),
+        slides=np.array([float(isinstance(j, PrismaticJoint)) for j in moving]),
         axis=np.array(
             [
                 joint.translation_axis()

@@ -118,6 +118,10 @@ def _used(folder: Path) -> None:
             shutil.rmtree(other, ignore_errors=True)
 
 
+# LLVM's third level takes a fifth longer to compile, and runs no faster here.
+if "NUMBA_OPT" not in os.environ:
+    CONFIG.OPT = type(CONFIG.OPT)(2)
+
 if not CONFIG.CACHE_LOCATOR_CLASSES:
     own = f"{__name__}.{BySource.__name__}"
     others = (locator.__name__ for locator in caching.CacheImpl._locator_classes)

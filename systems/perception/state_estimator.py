@@ -67,12 +67,10 @@ class StateEstimator(LeafSystem):
                 f"{config.ball_radius}, {config.tip_mass}"
             )
         self._ball_radius, self._tip_mass = config.ball_radius, config.tip_mass
-        self._chain = packed(chain)
+        self._chain, self._packed = chain, packed(chain)
         n = len(chain.mass)
         self.q_default = q_default = np.array(q_default, dtype=float)
-        p_tip, _, _ = tip_motion(
-            self._chain[0], q_default, np.zeros(n), np.zeros(n), 1.0
-        )
+        p_tip, _, _ = tip_motion(self._chain, q_default, np.zeros(n), np.zeros(n), 1.0)
         n_window = max(1, round(config.window_sec / config.period_sec))
         self._q = self.DeclareVectorInputPort("q", n)
         self._v = self.DeclareVectorInputPort("v", n)
@@ -123,12 +121,12 @@ class StateEstimator(LeafSystem):
         before.setflags(write=False)  # As a Context's state is.
         at = np.zeros(3)
         estimate(
-            self._chain, q_default, zero, zero, at, at, np.zeros(1), self._tip_mass,
+            self._packed, q_default, zero, zero, at, at, np.zeros(1), self._tip_mass,
             self._ball_radius, before,
         )  # fmt: skip
         observer = np.zeros(7)
         observer.setflags(write=False)
-        mobility = tip_mobility(self._chain[0], q_default)
+        mobility = tip_mobility(self._chain, q_default)
         observe_force(observer, at, at, mobility, self._gain, self._dt)
 
     def _mean_force(self, context, output):
@@ -153,7 +151,7 @@ class StateEstimator(LeafSystem):
     def _update(self, context, discrete_state):
         window = context.get_discrete_state(self._window).value()
         finite, felt, x, after, valid = estimate(
-            self._chain,
+            self._packed,
             self._q.Eval(context),
             self._v.Eval(context),
             self._torque.Eval(context),
@@ -183,7 +181,7 @@ class StateEstimator(LeafSystem):
                     observer,
                     x[V_TIP],
                     u / self._tip_mass,
-                    tip_mobility(self._chain[0], np.asarray(self._q.Eval(context))),
+                    tip_mobility(self._chain, np.asarray(self._q.Eval(context))),
                     self._gain,
                     self._dt,
                 )

@@ -3,7 +3,7 @@
 import numba
 import numpy as np
 
-from makebreak.systems.arm.numerics.serial_chain import tip_kinematics
+from makebreak.systems.arm.numerics.serial_chain import chain_of, tip_kinematics
 
 
 @numba.njit(cache=True)
@@ -38,5 +38,5 @@ def tip_wrench(chain, q, torque):
     """
     if not np.any(torque):
         return np.zeros(6)
-    J = tip_kinematics(chain[0], q)[2]
+    J = tip_kinematics(chain_of(chain), q)[2]
     return np.linalg.solve(J @ J.T, J @ torque)

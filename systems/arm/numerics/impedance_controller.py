@@ -33,7 +33,12 @@ from makebreak.systems.arm.numerics.joint_limits import (
     is_free,
     within_limits,
 )
-from makebreak.systems.arm.numerics.serial_chain import chain_state, tip_kinematics
+from makebreak.systems.arm.numerics.packed import part
+from makebreak.systems.arm.numerics.serial_chain import (
+    chain_of,
+    chain_state,
+    tip_kinematics,
+)
 from makebreak.systems.numerics.joint_laws import JointLaws
 
 # Status bits.
@@ -110,6 +115,54 @@ class Law(NamedTuple):
     period: float  # Of a tick [s].
     force: ForceLaw
     laws: JointLaws  # Forces in the joints, as of joint_friction.to_compensate.
+
+
+@numba.njit(cache=True)
+def law_of(flat):
+    """The Law of which `flat` is the packed array; arrays of floats are not copied."""
+    effort_max, at = part(flat, 0)
+    step_max, at = part(flat, at)
+    q_lower, at = part(flat, at)
+    q_upper, at = part(flat, at)
+    speed_max, at = part(flat, at)
+    q_nominal, at = part(flat, at)
+    R_upright, at = part(flat, at)
+    stiffness, at = part(flat, at)
+    damping, at = part(flat, at)
+    numbers = flat[at : at + 2 * 14].reshape((14, 2))[:, 1]  # Each follows its size, 1.
+    joint, at = part(flat, at + 2 * 14)
+    kind, at = part(flat, at)
+    p, at = part(flat, at)
+    return Law(
+        effort_max,
+        step_max,
+        q_lower,
+        q_upper,
+        speed_max,
+        q_nominal,
+        R_upright.reshape((3, 3)),
+        stiffness,
+        damping,
+        numbers[0],
+        numbers[1],
+        numbers[2],
+        numbers[3],
+        int(numbers[4]),
+        numbers[5] != 0.0,
+        numbers[6],
+        ForceLaw(
+            numbers[7],
+            numbers[8],
+            numbers[9],
+            numbers[10],
+            numbers[11],
+            numbers[12],
+            numbers[13],
+        ),
+        JointLaws(
+            joint.astype(np.int64), kind.astype(np.int64), p.reshape((joint.size, 4))
+        ),
+    )
 
 
 def memory_size(n: int) -> int:
@@ -428,8 +481,8 @@ def held_motion(q, v, q_last, v_last, period):
 
 @numba.njit(cache=True)
 def tick(
-    chain,
-    law,
+    packed_chain,
+    packed_law,
     tau,
     memory,
     q,
@@ -446,12 +499,13 @@ def tick(
 ):
     """One tick of the controller.
 
-    Args: tau (n,): of the last tick; memory: of memory_size; others as in
-        impedance_torque and force_control; any of them may contain NaN. delay: from a
-        reading to the time when its torque acts [s]; no time (NaN, negative, infinite)
-        counts as 0.
+    Args: packed_chain, packed_law: SerialChain and Law (packed.py); tau (n,): of the
+        last tick; memory: of memory_size; others as in impedance_torque and
+        force_control; any of them may contain NaN. delay: from a reading to the time
+        when its torque acts [s]; no time (NaN, negative, infinite) counts as 0.
     Returns: tau (n,) within all limits, status (bits), memory.
     """
+    chain, law = chain_of(packed_chain), law_of(packed_law)
     n = q.shape[0]
     memory = memory.copy()
     status = 0
@@ -556,29 +610,9 @@ def _reference(chain, memory, q, x_d, has_pose, n):
     return held, rotation_of(held[3:7]), True
 
 
-@numba.njit(cache=True)
-def packed_tick(
-    chain, law, tau, memory, q, v, x_d, stiffness, damping, ratio, wrench,
-    directions, targets, measured, delay,
-):  # fmt: skip
-    """The tick with packed chain and law (packed.py)."""
-    return tick(
-        chain[0], law[0], tau, memory, q, v, x_d, stiffness, damping, ratio, wrench,
-        directions, targets, measured, delay,
-    )  # fmt: skip
-
-
-def warm_up(chain: np.ndarray, law: np.ndarray) -> None:
-    """Compiles the tick before the first update. Args: chain, law: packed.
-
-    tau and memory are read-only, as a Context's state is: for the compiler read-only
-    arrays are another type.
-    """
-    n = law["effort_max"].size
-    tau, memory = np.zeros(n), np.zeros(memory_size(n))
-    for state in (tau, memory):
-        state.setflags(write=False)
-    args = (np.zeros(n), np.zeros(n), np.full(19, np.nan))
+def warm_up(chain: np.ndarray, law: np.ndarray, n: int) -> None:
+    """Compiles the tick of n joints. Args: chain, law: packed."""
+    args = (np.zeros(n), np.zeros(memory_size(n)), np.zeros(n), np.zeros(n))
     none = np.zeros(6)
     gains, forces = (none, none, 0.0), (none, none, np.zeros(2), none)
-    packed_tick(chain, law, tau, memory, *args, *gains, *forces, 0.0)
+    tick(chain, law, *args, np.full(19, np.nan), *gains, *forces, 0.0)

@@ -1,34 +1,30 @@
-"""Constants of a compiled function in one structured array.
+"""Constants of a compiled function in one flat array.
 
 A call from Python into a compiled function unpacks a tuple of arrays each time, which
-takes some 0.3 us per array, longer than many kernels run. A packed tuple is one array.
+takes some 0.3 us per array, longer than many kernels run. A packed tuple is one array,
+of one type whatever the sizes are: an arm with another number of joints needs no other
+compiled code.
 """
 
+import numba
 import numpy as np
 
 
 def packed(constants) -> np.ndarray:
-    """A NamedTuple of numbers, arrays and further such tuples as one structured array
-    (1,). In a compiled function `packed(x)[0]` has the fields of x by name."""
-    out = np.zeros(1, dtype=_dtype(constants))
-    _fill(out[0], constants)
-    return out
-
-
-def _dtype(constants) -> np.dtype:
-    fields: list = []
-    for name, value in zip(constants._fields, constants, strict=True):
+    """A NamedTuple of numbers, arrays and further such tuples as one array: of each
+    number or array, in their order, its size and its entries as floats."""
+    parts: list = []
+    for value in constants:
         if hasattr(value, "_fields"):
-            fields.append((name, _dtype(value)))
+            parts.append(packed(value))
         else:
-            array = np.asarray(value)
-            fields.append((name, array.dtype, array.shape))
-    return np.dtype(fields, align=True)
+            entries = np.asarray(value, dtype=float).ravel()
+            parts += [[entries.size], entries]
+    return np.concatenate(parts)
 
 
-def _fill(record, constants) -> None:
-    for name, value in zip(constants._fields, constants, strict=True):
-        if hasattr(value, "_fields"):
-            _fill(record[name], value)
-        else:
-            record[name] = value
+@numba.njit(cache=True)
+def part(flat, at):
+    """The array (m,) whose size is at flat[at], not copied, and where the next is."""
+    end = at + 1 + int(flat[at])
+    return flat[at + 1 : end], end

@@ -15,6 +15,8 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from makebreak.systems.arm.numerics.packed import part
+
 
 class SerialChain(NamedTuple):
     """Constants of the arm: link i moves about, or along, joint i, whose frame it has.
@@ -23,7 +25,7 @@ class SerialChain(NamedTuple):
 
     R_PJ: np.ndarray  # (n, 3, 3) joint i in link i - 1's frame (the world's for i = 0),
     p_PJ: np.ndarray  # (n, 3) [m] at zero.
-    slides: np.ndarray  # (n,) int: 1 if the joint is prismatic, else 0.
+    slides: np.ndarray  # (n,) 1.0 if the joint is prismatic, else 0.0.
     axis: np.ndarray  # (n, 3) unit axis in its own frame.
     mass: np.ndarray  # (n,) [kg] with what is welded to the link.
     p_com: np.ndarray  # (n, 3) centre of mass in the link's frame [m].
@@ -33,6 +35,38 @@ class SerialChain(NamedTuple):
     gravity: np.ndarray  # (3,) [m/s2]
     R_LE: np.ndarray  # (3, 3) tip frame E in the last link's frame,
     p_LE: np.ndarray  # (3,) [m].
+
+
+@numba.njit(cache=True)
+def chain_of(flat):
+    """The SerialChain of which `flat` is the packed array; no array is copied."""
+    R_PJ, at = part(flat, 0)
+    p_PJ, at = part(flat, at)
+    slides, at = part(flat, at)
+    axis, at = part(flat, at)
+    mass, at = part(flat, at)
+    p_com, at = part(flat, at)
+    I_com, at = part(flat, at)
+    rotor, at = part(flat, at)
+    damping, at = part(flat, at)
+    gravity, at = part(flat, at)
+    R_LE, at = part(flat, at)
+    p_LE, at = part(flat, at)
+    n = mass.size
+    return SerialChain(
+        R_PJ.reshape((n, 3, 3)),
+        p_PJ.reshape((n, 3)),
+        slides,
+        axis.reshape((n, 3)),
+        mass,
+        p_com.reshape((n, 3)),
+        I_com.reshape((n, 3, 3)),
+        rotor,
+        damping,
+        gravity,
+        R_LE.reshape((3, 3)),
+        p_LE,
+    )
 
 
 class ChainState(NamedTuple):

@@ -4,7 +4,7 @@ import numba
 import numpy as np
 
 from makebreak.systems.arm.numerics.impedance_controller import quaternion_of
-from makebreak.systems.arm.numerics.serial_chain import tip_kinematics
+from makebreak.systems.arm.numerics.serial_chain import chain_of, tip_kinematics
 
 
 @numba.njit(cache=True)
@@ -13,7 +13,7 @@ def tip_pose(chain, q):
 
     Args: chain: a packed SerialChain.
     """
-    p, R, _ = tip_kinematics(chain[0], q)
+    p, R, _ = tip_kinematics(chain_of(chain), q)
     pose = np.empty(7)
     pose[:3] = p
     pose[3:] = quaternion_of(R)
@@ -26,7 +26,7 @@ def tip_velocity(chain, q, v):
 
     Args: chain: a packed SerialChain.
     """
-    J = tip_kinematics(chain[0], q)[2]
+    J = tip_kinematics(chain_of(chain), q)[2]
     velocity = np.zeros(6)
     for k in range(6):
         for i in range(v.shape[0]):

@@ -3,7 +3,7 @@
 import numba
 import numpy as np
 
-from makebreak.systems.arm.numerics.serial_chain import chain_state
+from makebreak.systems.arm.numerics.serial_chain import chain_of, chain_state
 from makebreak.systems.contact_mpc.numerics.ball_state import (
     Q_BALL,
     W_BALL,
@@ -86,7 +86,7 @@ def estimate(chain, q, v, torque, p_ball, v_ball, seen, tip_mass, radius, window
         return False, False, after, after, -1.0
     felt = np.isfinite(torque.sum())
     p_tip, v_tip, u = tip_motion(
-        chain[0], q, v, torque if felt else np.zeros(q.size), tip_mass
+        chain_of(chain), q, v, torque if felt else np.zeros(q.size), tip_mass
     )
     n = window.size // 3
     valid = 1.0 if seen[0] > 0.5 else 0.0
