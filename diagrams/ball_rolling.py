@@ -67,7 +67,11 @@ from makebreak.diagrams.wiring import (
 from makebreak.models.fruit import FRUITS
 from makebreak.models.scene import Scene
 from makebreak.models.tip_and_ball import make_tip_and_ball
-from makebreak.systems.arm.arm_reference import ArmReference, ArmReferenceConfig
+from makebreak.systems.arm.arm_reference import (
+    ArmReference,
+    ArmReferenceConfig,
+    FollowConfig,
+)
 from makebreak.systems.arm.impedance_controller import (
     HybridConfig,
     ImpedanceController,
@@ -236,7 +240,7 @@ def add_ball_rolling(
     else:
         c3_settings = c3_config(config.planner, n_lam, projection)
         target = task = _add_cycle(builder, config, model, n_lam, p_tip)
-        reference_settings = ArmReferenceConfig(follow_hard=follow_hard)
+        reference_settings = ArmReferenceConfig(follow=FollowConfig(hard=follow_hard))
     c3 = builder.AddNamedSystem("c3_mpc", C3Mpc(c3_settings, CONTROL, OFFSET["c3"]))
     reference = builder.AddNamedSystem(
         "arm_reference",

@@ -102,6 +102,7 @@ from makebreak.systems.changing_contact.velocity_shaper import (
 )
 from makebreak.systems.contact_mpc.numerics.rolling_task import (
     CirclePath,
+    RepositionConfig,
     RollingConfig,
     surface_height,
 )
@@ -198,7 +199,7 @@ class TouchConfig:
 
 
 def _brisk_ball() -> BallRollingConfig:
-    rolling = RollingConfig(reposition_sec=BRISK_SEC)
+    rolling = RollingConfig(reposition=RepositionConfig(sec=BRISK_SEC))
     return BallRollingConfig(
         camera=CameraConfig(renderer="drawn"),
         task=RollingTaskConfig(rolling=rolling),

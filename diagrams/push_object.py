@@ -508,10 +508,10 @@ def _switchable(
 
 def _add_touch_down(builder, config, model, planning, estimator, reference) -> None:
     """The learned speed of a touch, which slows the reference before one."""
-    if config.touch.most > config.reference.push_speed:
+    if config.touch.most > config.reference.limits.push_speed:
         raise ValueError(
             f"touch.most is {config.touch.most}, expected at most "
-            f"reference.push_speed, {config.reference.push_speed} m/s"
+            f"reference.limits.push_speed, {config.reference.limits.push_speed} m/s"
         )
     touch = builder.AddNamedSystem(
         "touch_down",

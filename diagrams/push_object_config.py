@@ -9,7 +9,11 @@ import numpy as np
 from makebreak.diagrams.camera import CameraConfig
 from makebreak.models.model_files import MODELS
 from makebreak.models.pushed_object import PushedObject, support_spheres
-from makebreak.systems.arm.arm_reference import ArmReferenceConfig
+from makebreak.systems.arm.arm_reference import (
+    ArmReferenceConfig,
+    ReferenceLimits,
+    TouchConfig,
+)
 from makebreak.systems.arm.impedance_controller import ImpedanceConfig
 from makebreak.systems.changing_contact.touch_down import TouchDownConfig
 from makebreak.systems.contact_mpc.c3_mpc import C3Config
@@ -175,11 +179,9 @@ class PushObjectConfig:
     touch: TouchDownConfig = field(default_factory=TouchDownConfig)
     reference: ArmReferenceConfig = field(
         default_factory=lambda: ArmReferenceConfig(
-            force_max=8.0,
-            acceleration_max=3.0,
             tip_mass=TIP_MASS,
-            touch_speed=0.15,
-            push_speed=0.2,
+            limits=ReferenceLimits(force_max=8.0, acceleration_max=3.0, push_speed=0.2),
+            touch=TouchConfig(speed=0.15),
         )
     )
     impedance: ImpedanceConfig = field(

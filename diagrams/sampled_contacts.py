@@ -18,7 +18,7 @@ from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from makebreak.diagrams import wiring
 from makebreak.diagrams.wiring import refuse_changed
 from makebreak.models.tip_and_ball import TipAndBall
-from makebreak.systems.arm.arm_reference import ArmReferenceConfig
+from makebreak.systems.arm.arm_reference import ArmReferenceConfig, ReferenceLimits
 from makebreak.systems.contact_mpc.c3_mpc import C3Config
 from makebreak.systems.contact_mpc.contact_sampler import (
     ContactSampler,
@@ -109,7 +109,9 @@ class SampledContactsConfig:
     # 1.5 to 3 mm too large, and the tip would strike the ball.
     gap_allowance: float = 0.003
     reference: ArmReferenceConfig = field(
-        default_factory=lambda: ArmReferenceConfig(force_max=8.0, acceleration_max=3.0)
+        default_factory=lambda: ArmReferenceConfig(
+            limits=ReferenceLimits(force_max=8.0, acceleration_max=3.0)
+        )
     )
 
 

@@ -137,6 +137,10 @@ def nearest(name: str, valid: Iterable[str]) -> str:
 
     if not valid:
         return "there is none"
+    # What was a prefix is a group now: roll_sec is roll.sec.
+    same = [v for v in valid if v.replace(".", "_") == name.replace(".", "_")]
+    if len(same) == 1:
+        return f"did you mean {same[0]}?"
     ranked = sorted(valid, key=likeness, reverse=True)
     least = max([0.6, *(likeness(v)[0] - 0.1 for v in ranked[:1])])
     close = [v for v in ranked[:3] if likeness(v)[0] >= least]
@@ -268,6 +272,18 @@ def hints_of(schema: type) -> dict[str, Any]:
     return typing.get_type_hints(schema, include_extras=True)
 
 
+def field_types(schema: type) -> dict[str, Any]:
+    """{dotted name: type} of all fields of a dataclass and of those nested in it."""
+    fields: dict[str, Any] = {}
+    hints = hints_of(schema)
+    for f in dataclasses.fields(schema):
+        fields[f.name] = hints[f.name]
+        if dataclasses.is_dataclass(hints[f.name]):
+            nested = field_types(hints[f.name])
+            fields |= {f"{f.name}.{name}": hint for name, hint in nested.items()}
+    return fields
+
+
 def merge(schema: type, mapping: dict, config=None, prefix: str = ""):
     """`config` with the fields in `mapping` replaced, nested ones merged; a new
     `schema` if `config` is None.
@@ -280,7 +296,15 @@ def merge(schema: type, mapping: dict, config=None, prefix: str = ""):
     for key, value in mapping.items():
         name = f"{prefix}{key}"
         if name not in fields:
-            raise ValueError(f"unknown key {shown(name)}; {nearest(name, fields)}")
+            within = [f"{prefix}{each}" for each in field_types(schema)]
+            moved = [  # Into a group: roll_sec is roll.sec.
+                each
+                for each in within
+                if each.replace(".", "_") == name.replace(".", "_")
+                or each.endswith(f".{key}")
+            ]
+            hint = nearest(name, moved or fields)
+            raise ValueError(f"unknown key {shown(name)}; {hint}")
         old = getattr(config, key, None)
         if dataclasses.is_dataclass(old) and isinstance(value, dict):
             changes[key] = merge(type(old), value, old, name + ".")

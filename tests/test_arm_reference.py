@@ -70,6 +70,20 @@ def one_force_lcs(tip_mass):
 REFERENCE = np.array([1, 2, 3, 40, 50, 60, 700, 800, 900]) * 1e-3
 
 
+def settings_of(**flat):
+    """follow_hard is follow.hard, force_max is limits.force_max."""
+    made = ArmReferenceConfig()
+    for key, value in flat.items():
+        group, _, name = key.partition("_")
+        if hasattr(made.limits, key):
+            setattr(made.limits, key, value)
+        elif group in ("follow", "touch"):
+            setattr(getattr(made, group), name, value)
+        else:
+            setattr(made, key, value)
+    return made
+
+
 def run(
     phase,
     x_next,
@@ -86,7 +100,7 @@ def run(
 ):
     builder = DiagramBuilder()
     lcs = one_force_lcs(2.0)
-    settings = ArmReferenceConfig(tip_mass=2.0, height=height, **config)
+    settings = settings_of(tip_mass=2.0, height=height, **config)
     arm = builder.AddNamedSystem("arm", ArmReference(settings, 1, np.array(p_tip), lcs))
     for name, value in dict(
         phase=[phase], reference=reference, x_next=x_next, lam=lam, status=[status]
@@ -196,11 +210,13 @@ def test_an_absurd_command_moves_the_reference_no_faster_than_speed_max(phase, s
     for t_end in (0.0126, 0.1251):
         pose, _ = run(phase, x_next, [0.0], t_end, reference=reference)
         # A period is 12.5 ms; the line that starts at t_end has gone 0.1 ms.
-        assert np.linalg.norm(pose[:3]) <= c.speed_max * t_end * (1.0 + 1e-9)
-        assert np.linalg.norm(pose[7:10]) <= c.speed_max * (1.0 + 1e-9)
+        assert np.linalg.norm(pose[:3]) <= c.limits.speed_max * t_end * (1.0 + 1e-9)
+        assert np.linalg.norm(pose[7:10]) <= c.limits.speed_max * (1.0 + 1e-9)
         fed_forward = np.linalg.norm(pose[13:16])
-        assert fed_forward <= c.acceleration_fed_forward_max * (1.0 + 1e-9)
-    assert np.linalg.norm(pose[:3]) > 0.9 * c.speed_max * 0.125  # Not frozen either.
+        assert fed_forward <= c.limits.acceleration_fed_forward_max * (1.0 + 1e-9)
+    assert (
+        np.linalg.norm(pose[:3]) > 0.9 * c.limits.speed_max * 0.125
+    )  # Not frozen either.
 
 
 def test_a_command_that_becomes_nan_ends_motion_and_push():
@@ -218,7 +234,7 @@ def test_nan_from_the_planner_leaves_the_reference_where_it_was():
 
 def test_while_rolling_the_reference_goes_down_slowly_and_up_as_it_is_told():
     x_next = np.zeros(19)
-    for v_z, expected in ((-0.3, -ArmReferenceConfig().down_max), (0.06, 0.06)):
+    for v_z, expected in ((-0.3, -ArmReferenceConfig().limits.down_max), (0.06, 0.06)):
         x_next[12] = v_z
         pose, _ = run(ROLL, x_next, [0.0], t_end=0.2)
         np.testing.assert_allclose(pose[9], expected, atol=1e-12)
@@ -321,20 +337,14 @@ def test_a_learned_speed_of_touching_holds_until_something_is_felt(
 
 
 def test_what_cannot_be_followed_is_refused_by_name():
-    with pytest.raises(ValueError, match="touch_speed is 0.3, expected at most push"):
+    with pytest.raises(ValueError, match="touch.speed is 0.3, expected at most limits"):
         ArmReference(
-            ArmReferenceConfig(touch_speed=0.3, push_speed=0.2), 1, np.zeros(3),
+            settings_of(touch_speed=0.3, push_speed=0.2), 1, np.zeros(3),
             one_force_lcs(1.0),
         )  # fmt: skip
     with pytest.raises(ValueError, match="nearest is -0.1, expected at least 0"):
-        ArmReference(
-            ArmReferenceConfig(nearest=-0.1), 1, np.zeros(3), one_force_lcs(1.0)
-        )
-    with pytest.raises(ValueError, match="touch_speed is 0.0, expected more"):
-        ArmReference(
-            ArmReferenceConfig(touch_speed=0.0), 1, np.zeros(3), one_force_lcs(1.0)
-        )
-    with pytest.raises(ValueError, match="follow_force is 0.0, expected more"):
-        ArmReference(
-            ArmReferenceConfig(follow_force=0.0), 1, np.zeros(3), one_force_lcs(1.0)
-        )
+        ArmReference(settings_of(nearest=-0.1), 1, np.zeros(3), one_force_lcs(1.0))
+    with pytest.raises(ValueError, match="touch.speed is 0.0, expected more"):
+        ArmReference(settings_of(touch_speed=0.0), 1, np.zeros(3), one_force_lcs(1.0))
+    with pytest.raises(ValueError, match="follow.force is 0.0, expected more"):
+        ArmReference(settings_of(follow_force=0.0), 1, np.zeros(3), one_force_lcs(1.0))

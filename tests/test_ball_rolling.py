@@ -45,7 +45,9 @@ from makebreak.systems.contact_mpc.numerics.c3_projections import (
 from makebreak.systems.contact_mpc.numerics.rolling_task import (
     ROLL,
     WAIT,
+    ApproachConfig,
     RollingConfig,
+    UnseenConfig,
 )
 from makebreak.systems.contact_mpc.rolling_task import RollingTaskConfig
 from makebreak.systems.perception.camera_shake import CameraShake
@@ -118,7 +120,7 @@ def updates(diagram):
 @pytest.fixture(scope="module")
 def diagram():
     """Where the tip does not feel for a surface below the one that it believes in."""
-    rolling = RollingConfig(n_std_below=0.0)
+    rolling = RollingConfig(approach=ApproachConfig(n_std_below=0.0))
     return make_ball_rolling(config(task=RollingTaskConfig(rolling=rolling)))
 
 
@@ -432,7 +434,9 @@ def faulty():
     with pytest.MonkeyPatch.context() as patch:
         faults = Faults(patch)
         # How long a hidden ball is pushed on is test_rolling_task's; here not at all.
-        at_once = RollingTaskConfig(rolling=RollingConfig(unseen_drift=1e-9))
+        at_once = RollingTaskConfig(
+            rolling=RollingConfig(unseen=UnseenConfig(drift=1e-9))
+        )
         run = Run(make_ball_rolling(config(radius_error_m=0.0, task=at_once)))
         k, rows = round(run.to_roll() / CONTROL), []
 
@@ -701,8 +705,8 @@ def test_true_gap_is_the_radius_error_where_the_estimate_is_right(diagram):
         ("learner=r_com", "learner: got"),
         ("object=apple", "object: got"),
         ("impedance.force_max=0", "force_max is 0.0, expected > 0"),
-        ("task.rolling.approach_speed=0", "task.rolling.approach_speed is 0.0"),
-        ("task.rolling.n_std=-1", "task.rolling.n_std is -1.0"),
+        ("task.rolling.approach.speed=0", "task.rolling.approach.speed is 0.0"),
+        ("task.rolling.approach.n_std=-1", "task.rolling.approach.n_std is -1.0"),
         ("tracker.ball_radius=0.03", "tracker.ball_radius is 0.03, expected 0.0315"),
         ("task.period_sec=0.1", "task.period_sec is 0.1, expected 0.0125"),
         (
@@ -713,8 +717,8 @@ def test_true_gap_is_the_radius_error_where_the_estimate_is_right(diagram):
         ("ball_noise_m=-0.001", "ball_noise_m is -0.001, expected >= 0"),
         ("task.radius=0", "task.radius is 0.0, expected > 0"),
         ("task.center=[0.5]", r"task.center is [0.5], expected 2 numbers"),
-        ("task.rolling.reposition_sec=0", "task.rolling.reposition_sec is 0.0"),
-        ("task.rolling.ease=0.7", "task.rolling.ease is 0.7"),
+        ("task.rolling.reposition.sec=0", "task.rolling.reposition.sec is 0.0"),
+        ("task.rolling.reposition.ease=0.7", "task.rolling.reposition.ease is 0.7"),
         ("world=nowhere.yaml", "nowhere.yaml does not exist"),
         ("radius_err=1", "did you mean radius_error_m"),
     ],

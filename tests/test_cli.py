@@ -33,7 +33,7 @@ from makebreak.scripts.cli.arguments import make_parser
 from makebreak.scripts.runner import trials
 from makebreak.scripts.runner.close_contact_loop import SETTINGS
 from makebreak.scripts.runner.criteria import Criteria
-from makebreak.scripts.runner.settings import apply_settings
+from makebreak.scripts.runner.settings import apply_settings, load_config
 
 ALL = dict(experiments.EXPERIMENTS)
 PYPROJECT = Path(__file__).resolve().parent.parent / "pyproject.toml"
@@ -274,13 +274,36 @@ def test_an_unknown_key_is_a_short_line_that_begins_with_what_is_near(name):
     assert said.endswith(f"(makebreak list {name} lists all)") and len(said) < 200
 
 
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("task.rolling.roll_sec", "task.rolling.roll.sec"),
+        ("task.rolling.withdraw_speed", "task.rolling.unseen.withdraw_speed"),
+        ("contacts.reference.touch_speed", "contacts.reference.touch.speed"),
+        ("contacts.reference.speed_max", "contacts.reference.limits.speed_max"),
+    ],
+)
+def test_a_setting_that_is_in_a_group_now_is_refused_with_its_new_name(
+    tmp_path, old, new
+):
+    schema = import_module(ALL["ball_rolling"]).Config
+    with pytest.raises(ValueError, match=f"unknown key {old}; did you mean {new}[? ]"):
+        apply_settings(schema(), [f"{old}=1"])
+    text = "1"
+    for word in reversed(old.split(".")):
+        text = f"{{{word}: {text}}}"
+    (tmp_path / "old.yaml").write_text(text)
+    with pytest.raises(ValueError, match=f"unknown key {old}; did you mean {new}[? ]"):
+        load_config(schema, tmp_path / "old.yaml")
+
+
 def test_infinity_is_accepted_where_it_means_that_there_is_no_limit():
     config = import_module(ALL["push_object"]).Config()
-    for key in ("impedance.force_max", "reference.touch_speed", "sampler.budget_sec"):
+    for key in ("impedance.force_max", "reference.touch.speed", "sampler.budget_sec"):
         before = reduce(getattr, key.split("."), apply_settings(config, [f"{key}=0.5"]))
         after = reduce(getattr, key.split("."), apply_settings(config, [f"{key}=inf"]))
         assert (before, after) == (0.5, np.inf)
-    for key in ("reference.speed_max", "impedance.posture_damping", "friction"):
+    for key in ("reference.limits.speed_max", "impedance.posture_damping", "friction"):
         with pytest.raises(ValueError, match=f'{key}: got ".inf", expected a number'):
             apply_settings(config, [f"{key}=inf"])
     with pytest.raises(ValueError, match="expected a number"):

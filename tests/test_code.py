@@ -377,6 +377,37 @@ def test_a_definition_without_a_docstring_is_found(tmp_path):
     assert public_without_docstring(tmp_path) == ["gap/a.py: b", "gap/a.py: d"]
 
 
+def wide_configs(root):
+    """{`file: class`: how many plain settings it has} of the settings of systems and
+    diagrams (dataclasses that can be changed) that have eight or more. A group, which
+    is a dataclass itself, counts as none."""
+    found = {}
+    for path in sorted(
+        p for r in ("systems", "diagrams") for p in root.glob(f"{r}/**/*.py")
+    ):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if not isinstance(node, ast.ClassDef):
+                continue
+            if "dataclass" not in map(ast.unparse, node.decorator_list):
+                continue
+            kinds = [
+                ast.unparse(each.annotation)
+                for each in node.body
+                if isinstance(each, ast.AnnAssign)
+            ]
+            plain = r"(float|int|bool|str|Literal|list\[(float|int|str|bool|list)\b)"
+            n = sum(bool(re.match(plain, kind)) for kind in kinds)
+            if n >= 8:
+                found[f"{path.relative_to(root)}: {node.name}"] = n
+    return found
+
+
+def test_settings_of_many_values_have_groups():
+    """docs/design_notes.md says which are better flat. Lower these numbers."""
+    wide = wide_configs(ROOT)
+    assert len(wide) <= 33 and max(wide.values()) <= 16, wide
+
+
 def test_linked_files_exist():
     dead = [f"{d.name}: {t}" for d, t in links() if not (d.parent / t).exists()]
     assert dead == []

@@ -24,11 +24,11 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 import makebreak.gap.workflow  # noqa: F401  (Imported before the fork.)
+from makebreak.models.typed_yaml import field_types
 from makebreak.scripts.cli import commands as cli
 from makebreak.scripts.cli import gap_command, run_command
 from makebreak.scripts.experiments import EXPERIMENTS, load_experiment
 from makebreak.scripts.runner import session
-from makebreak.scripts.runner.settings import field_types
 
 CPU_SEC, WALL_SEC = 20, 240  # The machine may be busy; a hang uses CPU or none at all.
 SEARCH_SEC = 120  # A whole search of `gap`, whose bar moves, is no hang after 20 s.

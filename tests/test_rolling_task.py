@@ -17,6 +17,7 @@ from makebreak.systems.contact_mpc.numerics.rolling_task import (
     ROLL,
     WAIT,
     CirclePath,
+    RollConfig,
     RollingConfig,
     TaskState,
     landing,
@@ -78,17 +79,17 @@ def test_reposition_passes_over_the_ball_and_lands_behind_a_rolling_one(v_ball):
     tip = [*(ball + [0.0, 0.015]), surface_height(0.015, R_BALL, R_TIP)]
     v_tip = [*(2.0 * v_ball), 0.0]  # On top of a rolling ball.
     start = TaskState(ROLL, -10.0, tip, v_tip, np.zeros(3))
-    config, history = run_task(start, RollingConfig().reposition_sec, ball, v_ball)
+    config, history = run_task(start, RollingConfig().reposition.sec, ball, v_ball)
     for t, state, _ in history[:-1]:
         assert state.phase == REPOSITION
         p_ball = np.array([*(ball + v_ball * t), R_BALL])
         assert np.linalg.norm(state.p - p_ball) > R_BALL + R_TIP - 1e-9
     t, state, _ = history[-1]
     p_ball = ball + v_ball * t
-    behind = p_ball - PATH.heading(p_ball) * config.land_behind
+    behind = p_ball - PATH.heading(p_ball) * config.land.behind
     # The landing point turns with the path while the ball rolls the last 12.5 ms.
     np.testing.assert_allclose(state.p[:2], behind, atol=2e-4)
-    z = surface_height(config.land_behind, R_BALL, R_TIP) + config.land_above
+    z = surface_height(config.land.behind, R_BALL, R_TIP) + config.land.above
     np.testing.assert_allclose(state.p[2], z, atol=1e-9)
 
 
@@ -133,7 +134,7 @@ def test_a_ball_that_is_not_seen_stops_the_push_and_lifts_the_tip():
 def phases_after_a_sight(v_ball, seen_sec, t_end=5.0):
     """How long a push goes on whose ball, seen at velocity v_ball, is then hidden."""
     start = TaskState(ROLL, 0.0, [0.6, 0.0, 0.08], np.zeros(3), np.zeros(3))
-    state, config = start, RollingConfig(roll_sec=9.0)
+    state, config = start, RollingConfig(roll=RollConfig(sec=9.0))
     for k in range(round(t_end / DT)):
         x = pack([0.6, 0, 0.08], np.zeros(3), [0.6, 0, R_BALL], [*v_ball, 0], R_BALL)
         state = next_state(config, PATH, state, k * DT, DT, x, 0.0,
@@ -178,7 +179,7 @@ def test_a_tip_that_hides_the_ball_withdraws_until_it_is_seen():
     # Not before it is above the ball, and no faster than it may.
     moved = abs(p[:, 0] - p[0, 0]) > 1e-9
     assert p[moved][0, 2] > 2 * R_BALL + R_TIP
-    assert np.hypot(v[:, 0], v[:, 1]).max() <= config.withdraw_speed + 1e-12
+    assert np.hypot(v[:, 0], v[:, 1]).max() <= config.unseen.withdraw_speed + 1e-12
     assert abs(np.diff(v[:, :2], axis=0)).max() <= 1.0 * DT + 1e-12
     # Without a place to go to it would stay, and wait for ever.
     stays = TaskState(WAIT, 0.0, [0.605, 0.0, 0.12], np.zeros(3), np.zeros(3), 0.12)
@@ -221,9 +222,9 @@ def test_a_long_reposition_takes_longer_and_is_no_faster():
     config, fastest = RollingConfig(), []
     for far in (1.0, 2.0):
         ball = np.array([0.6, 0.0])
-        tip = [0.6, config.reposition_far * far - config.land_behind, 0.2]
+        tip = [0.6, config.reposition.far * far - config.land.behind, 0.2]
         start = TaskState(ROLL, -10.0, tip, np.zeros(3), np.zeros(3))
-        T = config.reposition_sec * far
+        T = config.reposition.sec * far
         _, history = run_task(start, T + 2 * DT, ball, np.zeros(2))
         repositions = [s for _, s, _ in history if s.phase == REPOSITION]
         # The heading, and so the place to land, turns by 1 % of the way.
@@ -240,7 +241,7 @@ def test_the_less_a_ball_coasts_the_nearer_to_its_top_the_tip_lands(strayed, off
     config = RollingConfig()
     p, _ = landing(config, PATH, x, 0.0, 0.1, R_BALL, R_TIP, strayed)
     np.testing.assert_allclose(np.hypot(*(p[:2] - [0.6, 0.0])), offset, rtol=1e-12)
-    reach = np.linalg.norm(p - [0.6, 0.0, R_BALL + config.land_above])
+    reach = np.linalg.norm(p - [0.6, 0.0, R_BALL + config.land.above])
     np.testing.assert_allclose(reach, R_BALL + R_TIP, rtol=1e-12)
 
 
@@ -463,7 +464,7 @@ def approach(surface, gap_std, T=3.0, v_ball=lambda t: np.zeros(2)):
     config = RollingConfig()
     ball = np.array([0.6, 0.0])
     state = TaskState(ROLL, -10.0, [0.6, 0.0, 0.1], np.zeros(3), np.zeros(3))
-    z_land = surface_height(config.land_behind, R_BALL, R_TIP) + config.land_above
+    z_land = surface_height(config.land.behind, R_BALL, R_TIP) + config.land.above
     rows = []
     for k in range(round(T / DT)):
         v = [*v_ball(k * DT), 0.0]
@@ -484,18 +485,18 @@ def test_of_an_uncertain_height_the_last_part_is_slow_and_ends_where_it_touches(
     # 2.5 deviations of 8 mm above the surface, on which the landing point is 3 mm high.
     np.testing.assert_allclose(states[0].p[2], z_land + 0.017, atol=1e-9)
     # The reposition's plan ends at rest; from there the descent is slow.
-    assert max(-s.v[2] for s in states) <= config.approach_speed + 1e-12
+    assert max(-s.v[2] for s in states) <= config.approach.speed + 1e-12
     assert rows[-1][1].phase == ROLL
     # Over within one tick of what is felt: at most 0.2 mm and a tick's descent inside.
     end = rows[-1][1].p[2] - (z_land + 0.012)
-    assert -2e-4 - 2 * config.approach_speed * DT <= end <= 0.0
+    assert -2e-4 - 2 * config.approach.speed * DT <= end <= 0.0
 
 
 def test_a_touch_that_does_not_come_ends_the_approach_at_the_landing_point():
     config, z_land, rows = approach(surface=-0.01, gap_std=0.002)
     assert rows[-1][1].phase == ROLL
     np.testing.assert_allclose(
-        rows[-1][1].p[2], z_land, atol=2 * config.approach_speed * DT
+        rows[-1][1].p[2], z_land, atol=2 * config.approach.speed * DT
     )
 
 
@@ -524,11 +525,11 @@ def test_a_surface_of_which_little_is_known_is_felt_for_below_where_it_is_believ
     assert rows[-1][1].phase == ROLL
     # As above: a tick or two of descent inside.
     inside = z_land - 0.011 - rows[-1][1].p[2]
-    assert 0.0 <= inside <= 2e-4 + 2 * config.approach_speed * DT
+    assert 0.0 <= inside <= 2e-4 + 2 * config.approach.speed * DT
     # What is not there is not looked for beyond 1.5 deviations.
     _, _, rows = approach(surface=-1.0, gap_std=0.008)
     np.testing.assert_allclose(
-        rows[-1][1].p[2], z_land - 0.003 - 0.012, atol=2 * config.approach_speed * DT
+        rows[-1][1].p[2], z_land - 0.003 - 0.012, atol=2 * config.approach.speed * DT
     )
 
 
@@ -541,9 +542,9 @@ def test_a_ball_that_does_not_coast_is_felt_for(change, felt):
 
     config, _, rows = approach(surface=-1.0, gap_std=0.001, v_ball=rocks)
     # It is landed on nearer to its top.
-    more = max(change - config.coast_change, 0.0) / 0.06
-    offset = config.land_behind / (1.0 + more**2)
-    z_land = surface_height(offset, R_BALL, R_TIP) + config.land_above
+    more = max(change - config.land.coast_change, 0.0) / 0.06
+    offset = config.land.behind / (1.0 + more**2)
+    z_land = surface_height(offset, R_BALL, R_TIP) + config.land.above
     lowest = z_land - 0.003 - 0.0015 if felt else z_land
     assert rows[-1][1].phase == ROLL
     assert rows[-1][1].p[2] == pytest.approx(lowest, abs=5e-4)
@@ -555,7 +556,7 @@ def test_a_ball_that_does_not_coast_is_felt_for(change, felt):
     while state.phase == ROLL:
         t += DT
         state = next_state(config, PATH, state, t, DT, x, 0.0, True, R_BALL, R_TIP)
-    longest = config.roll_feel_sec if felt else config.roll_sec
+    longest = config.roll.feel_sec if felt else config.roll.sec
     assert t - rows[-1][1].since_sec == pytest.approx(longest, abs=2 * DT)
 
 

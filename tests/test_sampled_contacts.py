@@ -22,6 +22,7 @@ from makebreak.diagrams.sampled_contacts import (
 )
 from makebreak.models.tip_and_ball import TipAndBall, make_tip_and_ball
 from makebreak.scripts.experiments import ball_rolling as experiment
+from makebreak.systems.arm.arm_reference import TouchConfig
 from makebreak.systems.contact_mpc.lcs_builder import AnitescuLcs, ContactPair
 from makebreak.systems.contact_mpc.numerics.ball_state import (
     P_BALL,
@@ -482,7 +483,7 @@ def test_the_arm_goes_to_the_ball_and_rolls_it_on_along_the_circle():
 
 
 def test_a_touch_speed_has_the_force_that_it_asks_for():
-    reference = replace(SampledContactsConfig().reference, touch_speed=0.1)
+    reference = replace(SampledContactsConfig().reference, touch=TouchConfig(speed=0.1))
     contacts = replace(SampledContactsConfig(), reference=reference)
     diagram = make_ball_rolling(config(contacts=contacts))
     arm = diagram.GetSubsystemByName("arm_reference")
@@ -502,7 +503,7 @@ def _set(config, setting, value):
     [
         ({}, "contacts.gap_allowance", 0.002),
         ({}, "contacts.push.speed", 0.5),
-        ({"contact_sequence": "sampled"}, "task.rolling.lift", 0.02),
+        ({"contact_sequence": "sampled"}, "task.rolling.reposition.lift", 0.02),
         ({"contact_sequence": "sampled"}, "task.speed", 0.03),
         ({"contact_sequence": "sampled"}, "planner.N", 6),
         ({"contact_sequence": "sampled"}, "learning.eps", 1e-4),

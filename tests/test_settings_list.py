@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
+from makebreak.models.typed_yaml import field_types
 from makebreak.scripts.cli import commands as cli
 from makebreak.scripts.cli.settings_list import (
     comments_of,
@@ -12,7 +13,7 @@ from makebreak.scripts.cli.settings_list import (
     settings_text,
 )
 from makebreak.scripts.experiments import EXPERIMENTS, load_experiment
-from makebreak.scripts.runner.settings import apply_settings, field_types, to_plain
+from makebreak.scripts.runner.settings import apply_settings, to_plain
 
 
 @dataclass

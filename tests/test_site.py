@@ -11,7 +11,10 @@ import pytest
 
 import makebreak
 import makebreak.gap
+from makebreak.models.typed_yaml import field_types
 from makebreak.scripts.cli.arguments import make_parser, parse
+from makebreak.scripts.cli.command_inputs import experiment_module
+from makebreak.scripts.experiments import EXPERIMENTS
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
@@ -108,6 +111,13 @@ def test_options_that_documents_show_are_there():
     assert len(shown) > 80
     for page, words in shown:
         try:
-            parse(parser, words)
+            args = parse(parser, words)
         except ValueError as error:
             pytest.fail(f"{page}: makebreak {shlex.join(words)}: {error}")
+        if (name := getattr(args, "experiment", None)) not in EXPERIMENTS:
+            continue
+        settings = field_types(experiment_module(name).Config)
+        for group in (*getattr(args, "set", []), *getattr(args, "vary", [])):
+            for setting in group:
+                key = setting.partition("=")[0]
+                assert key in settings, (page, words)

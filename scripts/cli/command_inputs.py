@@ -11,10 +11,10 @@ from types import ModuleType
 import yaml
 
 import makebreak
-from makebreak.models.typed_yaml import nearest
+from makebreak.models.typed_yaml import field_types, nearest
 from makebreak.scripts import experiments
 from makebreak.scripts.cli.arguments import number
-from makebreak.scripts.runner.settings import apply_settings, field_types, load_config
+from makebreak.scripts.runner.settings import apply_settings, load_config
 
 MODELS = Path(__file__).resolve().parents[2] / "models"
 

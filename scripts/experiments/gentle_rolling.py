@@ -271,7 +271,7 @@ SUBSETS: dict[str, dict] = {
     # As ball_rolling repositions by default: slower, so it lands less hard by itself.
     "without, reposition in 0.55 s": {
         "gentle": False,
-        "ball.task.rolling.reposition_sec": 0.55,
+        "ball.task.rolling.reposition.sec": 0.55,
     },
     "without the learner": {"adapt": False},
     "without both": {"gentle": False, "adapt": False},

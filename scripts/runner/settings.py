@@ -4,7 +4,6 @@ import dataclasses
 import typing
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import yaml
@@ -12,6 +11,7 @@ import yaml
 from makebreak.models.typed_yaml import (
     Between,
     convert,
+    field_types,
     hints_of,
     load_yaml,
     merge,
@@ -20,18 +20,6 @@ from makebreak.models.typed_yaml import (
     read_yaml,
     shown,
 )
-
-
-def field_types(schema: type) -> dict[str, Any]:
-    """{dotted name: type} of all fields of a dataclass and of those nested in it."""
-    fields: dict[str, Any] = {}
-    hints = hints_of(schema)
-    for f in dataclasses.fields(schema):
-        fields[f.name] = hints[f.name]
-        if dataclasses.is_dataclass(hints[f.name]):
-            nested = field_types(hints[f.name])
-            fields |= {f"{f.name}.{name}": hint for name, hint in nested.items()}
-    return fields
 
 
 def load_config(schema: type, path: Path):

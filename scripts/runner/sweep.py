@@ -15,13 +15,13 @@ import yaml
 from matplotlib.figure import Figure
 from scipy.stats import binomtest
 
+from makebreak.models.typed_yaml import field_types
 from makebreak.scripts.runner.outputs import OutputFolder
 from makebreak.scripts.runner.result_page import result_page
 from makebreak.scripts.runner.settings import (
     apply_settings,
     convert,
     dump_config,
-    field_types,
     to_plain,
     unknown_key,
 )

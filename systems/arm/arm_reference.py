@@ -1,6 +1,7 @@
 """The arm's reference from the planner's commands (numerics/arm_reference.py)."""
 
 from dataclasses import dataclass, field
+from operator import attrgetter
 
 import numpy as np
 from pydrake.common.value import AbstractValue
@@ -28,40 +29,59 @@ from makebreak.systems.numerics.timing import timed
 
 
 @dataclass
-class ArmReferenceConfig:
-    """Settings of ArmReference: limits of what is asked of the arm."""
+class ReferenceLimits:
+    """Limits of what is asked of the arm."""
 
-    # Mass of the tip in the LCS, by which lam is turned into a force [kg].
-    tip_mass: float = 1.0
     force_max: float = 3.0  # Largest feed-forward force [N].
     # Largest acceleration of the velocity reference while the tip follows C3 [m/s2].
     acceleration_max: float = 1.5
-    # Largest downward speed while the tip follows C3 and `height` is null: contact may
-    # come early [m/s].
-    down_max: float = 0.04
-    # Speed that is added downwards where the tip has to feel for the ball and feels
-    # less than follow_force; it then also moves along with the ball [m/s]. Without
-    # effect where contacts are sampled.
-    follow_speed: float = 0.015
-    # Force from which on a tip that feels for the ball has found it [N]. Without effect
-    # where contacts are sampled.
-    follow_force: float = 1.0
-    # Whether a tip that feels for the ball moves at follow_speed towards its centre,
-    # and across that line as C3 has it: for a ball that is hard and smooth;
-    # gentle_rolling sets it. Without effect where contacts are sampled.
-    follow_hard: bool = False
-    # Largest speed while the tip follows C3 and feels less than touch_force: it may
-    # touch earlier than planned, and the impact grows with the speed [m/s].
-    touch_speed: float = np.inf
-    touch_force: float = 1.0  # Force from which on the tip counts as in contact [N].
-    # Largest speed while the tip follows C3, in contact too: a tip that slides along a
-    # side would hit the next corner at the speed that it has reached by then [m/s].
-    push_speed: float = np.inf
+    # Largest acceleration that is fed forward between two contacts [m/s2].
+    acceleration_fed_forward_max: float = 10.0
     # Largest speed of the reference, however far away a command is [m/s]. The task
     # itself stays below 0.35 m/s and 4 m/s2.
     speed_max: float = 0.5
-    # Largest acceleration that is fed forward between two contacts [m/s2].
-    acceleration_fed_forward_max: float = 10.0
+    # Largest speed while the tip follows C3, in contact too: a tip that slides along a
+    # side would hit the next corner at the speed that it has reached by then [m/s].
+    push_speed: float = np.inf
+    # Largest downward speed while the tip follows C3 and `height` is null: contact may
+    # come early [m/s].
+    down_max: float = 0.04
+
+
+@dataclass
+class FollowConfig:
+    """How a tip feels for the ball. Without effect where contacts are sampled."""
+
+    # Speed that is added downwards where the tip has to feel for the ball and feels
+    # less than `force`; it then also moves along with the ball [m/s].
+    speed: float = 0.015
+    # Force from which on a tip that feels for the ball has found it [N].
+    force: float = 1.0
+    # Whether a tip that feels for the ball moves at `speed` towards its centre, and
+    # across that line as C3 has it: for a ball that is hard and smooth; gentle_rolling
+    # sets it.
+    hard: bool = False
+
+
+@dataclass
+class TouchConfig:
+    """The speed before a touch, which may come earlier than planned."""
+
+    # Largest speed while the tip follows C3 and feels less than `force`: the impact
+    # grows with the speed [m/s].
+    speed: float = np.inf
+    force: float = 1.0  # Force from which on the tip counts as in contact [N].
+
+
+@dataclass
+class ArmReferenceConfig:
+    """Settings of ArmReference."""
+
+    # Mass of the tip in the LCS, by which lam is turned into a force [kg].
+    tip_mass: float = 1.0
+    limits: ReferenceLimits = field(default_factory=ReferenceLimits)
+    follow: FollowConfig = field(default_factory=FollowConfig)
+    touch: TouchConfig = field(default_factory=TouchConfig)
     # Height at which the tip stays while it follows C3 horizontally [m]; null: C3 moves
     # it up and down too. The diagram sets it.
     height: float | None = None
@@ -87,18 +107,18 @@ class ArmReference(LeafSystem):
 
     While C3 keeps an old command (its status is not 0), a rolling reference stays where
     it is, with zero force; so does any reference while its command is not finite. A
-    distant command is approached at speed_max, not within one period.
+    distant command is approached at limits.speed_max, not within one period.
 
     The fed-forward force alone moves a well damped tip by some mm/s: too slow for the
     dents of an object that rolls by under it, and without contact C3's tip runs ahead
     of the ball. So a tip that has to feel for the ball and measures no force moves down
     and along with the ball until it does. (On a hard ball it would hop on the spot:
-    there it pushes on meanwhile, see follow_hard.)
+    there it pushes on meanwhile, see follow.hard.)
 
     Inputs:  phase (1,), reference (9,) of RollingTask or PushTask; x_next (19,), lam
              (n_lam,), status (1,) of C3; lcs (abstract): the LCS of C3's command;
              feel (1,), optional, of RollingTask; tip_force (3,) [N]: estimated contact
-             force on the tip, needed with feel or a touch_speed; touch_speed (1,)
+             force on the tip, needed with feel or a touch.speed; touch_speed (1,)
              [m/s], optional, of TouchDown: replaces the setting unless it is NaN.
     Outputs: x_desired (19,) = [p, quaternion, v, w, a, alpha], with the identity as
              quaternion and no rotation; wrench (6,), force first [N], [N m];
@@ -112,19 +132,13 @@ class ArmReference(LeafSystem):
     def __init__(self, config: ArmReferenceConfig, n_lam: int, p_tip, lcs: LCS):
         super().__init__()
         check_settings(config)
-        if not config.follow_force > 0.0:
+        for name in ("follow.force", "touch.speed", "touch.force", "limits.push_speed"):
+            if not (value := attrgetter(name)(config)) > 0.0:
+                raise ValueError(f"{name} is {value}, expected more than 0")
+        if config.limits.push_speed < config.touch.speed < np.inf:
             raise ValueError(
-                f"follow_force is {config.follow_force}, expected more than 0"
-            )
-        for name in ("touch_speed", "touch_force", "push_speed"):
-            if not getattr(config, name) > 0.0:
-                raise ValueError(
-                    f"{name} is {getattr(config, name)}, expected more than 0"
-                )
-        if config.push_speed < config.touch_speed < np.inf:
-            raise ValueError(
-                f"touch_speed is {config.touch_speed}, expected at most push_speed, "
-                f"{config.push_speed} m/s"
+                f"touch.speed is {config.touch.speed}, expected at most "
+                f"limits.push_speed, {config.limits.push_speed} m/s"
             )
         if not 0.0 <= config.nearest < np.inf:
             raise ValueError(f"nearest is {config.nearest}, expected at least 0 m")
@@ -174,45 +188,46 @@ class ArmReference(LeafSystem):
             # D lam is the change of the tip's velocity by the contact in one step.
             lcs = self._lcs.Eval(context)
             on_tip = c.tip_mass / lcs.dt * (lcs.D[V_TIP] @ self._lam.Eval(context))
-            force = clip_norm(-on_tip, c.force_max)
+            force = clip_norm(-on_tip, c.limits.force_max)
             v = np.array(x_next[V_TIP])
             p = np.array(x_next[P_TIP])
             if self._feel.HasValue(context) and self._feel.Eval(context)[0] > 0.5:
                 felt = self._tip_force.Eval(context)[2]
-                lost = 1.0 - min(max(felt / c.follow_force, 0.0), 1.0)
+                lost = 1.0 - min(max(felt / c.follow.force, 0.0), 1.0)
                 change = np.zeros(3)
-                if c.follow_hard:
+                if c.follow.hard:
                     n = x_next[P_TIP] - x_next[P_BALL]
                     n /= max(np.sqrt(n @ n), 1e-9)
                     away = (v - x_next[V_BALL]) @ n
-                    change = -lost * (away + c.follow_speed) * n
+                    change = -lost * (away + c.follow.speed) * n
                 else:
                     change[:2] = lost * (x_next[V_BALL] - v)[:2]
-                    v[2] -= lost * c.follow_speed
+                    v[2] -= lost * c.follow.speed
                 p += change * c.period_sec
                 v += change
-            v[2] = max(v[2], -c.down_max)
+            v[2] = max(v[2], -c.limits.down_max)
             if c.height is not None:
                 p[2], v[2], force[2] = c.height, 0.0, 0.0
             p, v, force = no_nearer(p, v, force, c.nearest, c.wrist)
-            fastest, touch_speed = c.push_speed, c.touch_speed
+            fastest, touch_speed = c.limits.push_speed, c.touch.speed
             if self._touch_speed.HasValue(context):
                 learned = self._touch_speed.Eval(context)[0]
                 touch_speed = touch_speed if np.isnan(learned) else learned
             if touch_speed < fastest:
                 felt = np.linalg.norm(self._tip_force.Eval(context))
-                if not felt >= c.touch_force:
+                if not felt >= c.touch.force:
                     fastest = max(touch_speed, 0.0)
             if fastest < np.inf:
                 v = clip_norm(v, fastest)
                 p = start[:3] + clip_norm(p - start[:3], fastest * c.period_sec)
             target = np.concatenate((p, v, self._zero, force))
-            dv_max = c.acceleration_max * c.period_sec
+            dv_max = c.limits.acceleration_max * c.period_sec
         else:
             target = np.concatenate((self._reference.Eval(context), self._zero))
+        fastest = c.limits.speed_max
         end = next_end(
-            start, target, c.speed_max * c.period_sec, c.speed_max, dv_max,
-            c.acceleration_fed_forward_max,
+            start, target, fastest * c.period_sec, fastest, dv_max,
+            c.limits.acceleration_fed_forward_max,
         )  # fmt: skip
         discrete_state.set_value(self._line, np.concatenate((start, end, [t])))
 

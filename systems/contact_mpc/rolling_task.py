@@ -1,6 +1,7 @@
 """The phases of rolling a ball as a system (numerics/rolling_task.py)."""
 
 from dataclasses import dataclass, field, replace
+from operator import attrgetter
 
 import numpy as np
 from pydrake.common.value import AbstractValue
@@ -213,23 +214,21 @@ def _check(config: RollingTaskConfig):
     for name in ("speed", "lead_deg", "press"):
         if not np.isfinite(getattr(config, name)):
             raise ValueError(f"task.{name} is {getattr(config, name)}, expected finite")
-    for name in ("roll_sec", "roll_feel_sec", "reposition_sec", "approach_speed",
-                 "touch_force", "land_above", "coast_change", "withdraw_speed",
-                 "reposition_far", "unseen_drift"):  # fmt: skip
-        if not 0.0 < getattr(rolling, name) < np.inf:
-            raise ValueError(
-                f"task.rolling.{name} is {getattr(rolling, name)}, expected > 0"
-            )
+    for name in ("roll.sec", "roll.feel_sec", "reposition.sec", "reposition.far",
+                 "approach.speed", "approach.touch_force", "land.above",
+                 "land.coast_change", "unseen.drift", "unseen.withdraw_speed",
+                 ):  # fmt: skip
+        if not 0.0 < (value := attrgetter(name)(rolling)) < np.inf:
+            raise ValueError(f"task.rolling.{name} is {value}, expected > 0")
     if not rolling.integral_sec > 0.0:  # Infinite: none.
         raise ValueError(
             f"task.rolling.integral_sec is {rolling.integral_sec}, expected > 0"
         )
-    for name in ("n_std", "n_std_below", "approach_max", "unseen_speed"):
-        if not 0.0 <= getattr(rolling, name) < np.inf:
-            raise ValueError(
-                f"task.rolling.{name} is {getattr(rolling, name)}, expected >= 0"
-            )
-    if not 0.0 < rolling.ease <= 0.5:
+    for name in ("approach.n_std", "approach.n_std_below", "approach.max",
+                 "unseen.speed"):  # fmt: skip
+        if not 0.0 <= (value := attrgetter(name)(rolling)) < np.inf:
+            raise ValueError(f"task.rolling.{name} is {value}, expected >= 0")
+    if not 0.0 < (ease := rolling.reposition.ease) <= 0.5:
         raise ValueError(
-            f"task.rolling.ease is {rolling.ease}, expected > 0 and at most 0.5"
+            f"task.rolling.reposition.ease is {ease}, expected > 0 and at most 0.5"
         )

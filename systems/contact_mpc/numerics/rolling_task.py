@@ -11,7 +11,7 @@ and has to go back. The task therefore alternates between
                 feels something. Where little is known of the surface, or the ball does
                 not coast, it goes on to the lowest place where the surface may be.
     WAIT        the ball has not been seen for the time in which it may have gone 20 mm
-                (unseen_drift), or the measurement cannot be used. The tip lifts and
+                (unseen.drift), or the measurement cannot be used. The tip lifts and
                 pushes nothing. Since the arm itself may hide the ball, the tip then
                 withdraws until the ball is seen.
 
@@ -19,7 +19,7 @@ Source: ACI-MPC VII-B describes the behaviour (a push, then a new push from behi
 times and distances are ours (docs/ball_rolling.md).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numba import njit
@@ -43,8 +43,8 @@ APPROACH_SLOPE, APPROACH_STOP = 1.5, 0.3
 # slip over the ball and leave it behind.
 REACH = 0.015
 WITHDRAW_ACCELERATION = 1.0  # [m/s2]
-# With so much change of velocity beyond coast_change the tip lands at half the usual
-# distance behind the ball's top [m/s].
+# With so much change of velocity beyond land.coast_change the tip lands at half its
+# usual distance behind the ball's top [m/s].
 LAND_CHANGE = 0.06
 SPEED_SEC = 0.15  # The speed of a hidden ball is a mean over this time [s].
 GLIMPSE_SEC = 0.1  # The velocity of a ball that was seen for less is not known [s].
@@ -107,7 +107,7 @@ class TaskState:
     # Whether the tip has to feel for the ball: the approach goes on below where the
     # surface is believed to be, and the push of a ball that does not coast is longer.
     feel: bool = False
-    stretch: float = 1.0  # Duration of this reposition over reposition_sec.
+    stretch: float = 1.0  # Duration of this reposition over reposition.sec.
     seen_sec: float = 0.0  # For how long the ball has been seen, ...
     unseen_sec: float = 0.0  # ... or has not been seen.
     # The ball's velocity when it was last seen, a mean over SPEED_SEC [m/s].
@@ -127,47 +127,80 @@ class TaskState:
 
 
 @dataclass
-class RollingConfig:
-    """Times and distances of the cycle."""
+class RollConfig:
+    """A push, in which the ball rolls."""
 
-    roll_sec: float = 1.0  # Longest time of a push [s].
+    sec: float = 1.0  # Longest time of a push [s].
     # Longest time of a push in which the tip has to feel for the ball [s].
-    roll_feel_sec: float = 1.5
+    feel_sec: float = 1.5
     # Horizontal distance of the tip from the ball's centre, ahead of it or beside it,
     # at which a push ends [m].
-    roll_ahead: float = 0.025
-    # Time of a reposition, from lifting the tip to the landing [s].
-    reposition_sec: float = 0.55
+    ahead: float = 0.025
+
+
+@dataclass
+class RepositionConfig:
+    """The way from the end of a push to the next landing."""
+
+    sec: float = 0.55  # Time from lifting the tip to the landing [s].
+    # Horizontal distance above which it takes longer, in proportion [m].
+    far: float = 0.12
     lift: float = 0.015  # Clearance over the ball while the tip passes over it [m].
-    # Distance behind the ball's centre at which the tip lands, seen from above [m].
-    land_behind: float = 0.018
-    # Height of the landing point above where the ball's surface is believed to be [m].
-    land_above: float = 0.003
-    # Height above the believed surface at which the slow approach begins, in standard
-    # deviations of the gap.
-    n_std: float = 2.5
-    # Depth below the believed surface at which the approach of a tip that has to feel
-    # for the ball ends, in standard deviations of the gap.
-    n_std_below: float = 1.5
+    # Fraction of the time for going up, and the same for going down.
+    ease: float = 0.42
+
+
+@dataclass
+class LandConfig:
+    """Where the tip lands on the ball."""
+
+    # Distance behind the ball's centre, seen from above [m].
+    behind: float = 0.018
+    # Height above where the ball's surface is believed to be [m].
+    above: float = 0.003
     # Change of the velocity of an untouched ball above which it does not coast: the tip
     # has to feel for it [m/s].
     coast_change: float = 0.06
-    approach_speed: float = 0.035  # Speed of the slow approach down to the ball [m/s].
-    approach_max: float = 0.025  # Longest distance of the slow approach [m].
+
+
+@dataclass
+class ApproachConfig:
+    """The slow approach down to the ball."""
+
+    # Height above the believed surface at which it begins, in standard deviations of
+    # the gap.
+    n_std: float = 2.5
+    # Depth below the believed surface at which it ends for a tip that has to feel for
+    # the ball, in standard deviations of the gap.
+    n_std_below: float = 1.5
+    speed: float = 0.035  # [m/s]
+    max: float = 0.025  # Longest distance [m].
     # Vertical force, beyond that in the air, which is a touch [N].
     touch_force: float = 4.0
+
+
+@dataclass
+class UnseenConfig:
+    """What is done while the ball is not seen."""
+
     # Distance that a hidden ball may have rolled before it counts as lost: then the
     # task waits, and the tip withdraws [m].
-    unseen_drift: float = 0.02
+    drift: float = 0.02
     # Least speed at which a hidden ball is believed to roll [m/s].
-    unseen_speed: float = 0.006
+    speed: float = 0.006
     # Speed at which the tip withdraws from a ball that is not seen [m/s].
     withdraw_speed: float = 0.2
-    # Horizontal distance of a reposition above which it takes longer, in proportion
-    # [m].
-    reposition_far: float = 0.12
-    # Fraction of the reposition's time for going up, and the same for going down.
-    ease: float = 0.42
+
+
+@dataclass
+class RollingConfig:
+    """Times and distances of the cycle."""
+
+    roll: RollConfig = field(default_factory=RollConfig)
+    reposition: RepositionConfig = field(default_factory=RepositionConfig)
+    land: LandConfig = field(default_factory=LandConfig)
+    approach: ApproachConfig = field(default_factory=ApproachConfig)
+    unseen: UnseenConfig = field(default_factory=UnseenConfig)
     # Time constant of the integral action on the circle's radius [s]; inf: none.
     integral_sec: float = 6.0
 
@@ -189,11 +222,11 @@ def landing(config, path, x, gap, time_left, radius_ball, radius_tip, strayed=0.
         strayed: how much its velocity has changed while nothing touched it [m/s].
     """
     p_ball = x[P_BALL][:2] + x[V_BALL][:2] * time_left
-    more = max(strayed - config.coast_change, 0.0) / LAND_CHANGE
-    offset = config.land_behind / (1.0 + more**2)
+    more = max(strayed - config.land.coast_change, 0.0) / LAND_CHANGE
+    offset = config.land.behind / (1.0 + more**2)
     behind = -path.heading(p_ball) * offset
     z = surface_height(offset, radius_ball, radius_tip)
-    p = np.append(p_ball + behind, z + config.land_above - gap)
+    p = np.append(p_ball + behind, z + config.land.above - gap)
     return p, np.append(x[V_BALL][:2], 0.0)
 
 
@@ -214,8 +247,8 @@ def shifted(config, path, shift, x, dt):
 def approach_height(config, gap_std):
     """How far above the landing point the slow approach begins [m]; gap_std [m]. The
     landing point is itself above the surface."""
-    above = config.n_std * gap_std - config.land_above
-    return min(max(above, 0.0), config.approach_max)
+    above = config.approach.n_std * gap_std - config.land.above
+    return min(max(above, 0.0), config.approach.max)
 
 
 def reposition_step(
@@ -231,8 +264,8 @@ def reposition_step(
     Args: above: how far above the landing point it ends [m]; the ball may also be so
         much larger than believed, and is passed over accordingly.
     """
-    T = config.reposition_sec * state.stretch
-    T_ease = config.ease * T
+    T = config.reposition.sec * state.stretch
+    T_ease = config.reposition.ease * T
     elapsed = min(t + dt - state.since_sec, T)
     left = max(T - (elapsed - dt), dt)
     p_land, v_land = landing(
@@ -243,7 +276,7 @@ def reposition_step(
     p, v, a = (np.zeros(3) for _ in range(3))
     p[:2], v[:2], a[:2] = quintic(min(dt, left), left, start, end)
     top = 2.0 * radius_ball + radius_tip
-    z_clear = max(top - min(gap, 0.0) + config.lift + above, state.z_start)
+    z_clear = max(top - min(gap, 0.0) + config.reposition.lift + above, state.z_start)
     if elapsed < T_ease:
         begin = state.z_start, state.vz_start, 0.0
         p[2], v[2], a[2] = quintic(elapsed, T_ease, begin, (z_clear, 0.0, 0.0))
@@ -263,7 +296,8 @@ def withdraw_step(config, state, dt, goal):
     way = goal - state.p[:2]
     distance = np.sqrt(way @ way)
     fastest = min(
-        config.withdraw_speed, np.sqrt(2.0 * 0.5 * WITHDRAW_ACCELERATION * distance)
+        config.unseen.withdraw_speed,
+        np.sqrt(2.0 * 0.5 * WITHDRAW_ACCELERATION * distance),
     )
     change = fastest * way / max(distance, 1e-9) - state.v[:2]
     most = WITHDRAW_ACCELERATION * dt
@@ -287,10 +321,10 @@ def approach_step(config, path, state, dt, x, gap, radius_ball, radius_tip, gap_
     )
     lowest = p_land[2]
     if state.feel:
-        lowest -= config.land_above + config.n_std_below * gap_std
+        lowest -= config.land.above + config.approach.n_std_below * gap_std
     # At rest there, as a reposition without an approach ends.
     stop = np.sqrt(2.0 * APPROACH_STOP * max(state.p[2] - lowest - 2e-4, 0.0))
-    v[2] = max(state.v[2] - APPROACH_SLOPE * dt, -min(config.approach_speed, stop))
+    v[2] = max(state.v[2] - APPROACH_SLOPE * dt, -min(config.approach.speed, stop))
     p[2] = state.p[2] + 0.5 * (state.v[2] + v[2]) * dt
     return p, v, a, bool(p[2] <= lowest + 3e-4)
 
@@ -338,7 +372,7 @@ def _pushes(config, path, x, reach) -> bool:
     heading = path.heading(x[P_BALL])
     behind = min(off @ heading, 0.0) * heading
     beside = off - behind
-    return bool(beside @ beside < config.roll_ahead**2 and off @ off < reach**2)
+    return bool(beside @ beside < config.roll.ahead**2 and off @ off < reach**2)
 
 
 def next_state(
@@ -365,9 +399,9 @@ def next_state(
 
     def lift_from(phase):
         p, v = x[P_TIP], x[V_TIP]
-        left = config.reposition_sec
+        left = config.reposition.sec
         goal, _ = landing(config, path, x, gap, left, radius_ball, radius_tip)
-        far = float(np.hypot(*(goal - p)[:2])) / config.reposition_far
+        far = float(np.hypot(*(goal - p)[:2])) / config.reposition.far
         return TaskState(
             phase, t, p, v, np.zeros(3), p[2], v[2], stretch=max(1.0, far), **sight
         )
@@ -382,16 +416,18 @@ def next_state(
     else:
         sight["unseen_sec"] = state.unseen_sec + dt
     state = replace(state, **sight)
-    speed = max(float(np.hypot(*state.v_seen)), config.unseen_speed)
+    speed = max(float(np.hypot(*state.v_seen)), config.unseen.speed)
     drift = state.unseen_sec * speed
-    lost = not hidden or drift > config.unseen_drift
+    lost = not hidden or drift > config.unseen.drift
     if not valid and (state.phase == WAIT or lost):
         if state.phase != WAIT:
             state = lift_from(WAIT)
-        T = config.reposition_sec
+        T = config.reposition.sec
         elapsed = min(t + dt - state.since_sec, T)
         begin = state.z_start, state.vz_start, 0.0
-        z_end = max(2 * radius_ball + radius_tip + 2 * config.lift, state.z_start)
+        z_end = max(
+            2 * radius_ball + radius_tip + 2 * config.reposition.lift, state.z_start
+        )
         z, vz, az = quintic(elapsed, T, begin, (z_end, 0.0, 0.0))
         slow = max(0.0, 1.0 - 5.0 * dt / T)
         v_xy = state.v[:2] * slow
@@ -406,25 +442,26 @@ def next_state(
     if state.phase == WAIT:
         state = lift_from(REPOSITION)
     if state.phase == ROLL:
-        longest = config.roll_feel_sec if state.feel else config.roll_sec
+        longest = config.roll.feel_sec if state.feel else config.roll.sec
         near = _pushes(config, path, x, radius_ball + radius_tip)
         if t - state.since_sec < longest and near:
             return state
         state = lift_from(REPOSITION)
-    strays = state.strayed > config.coast_change
+    strays = state.strayed > config.land.coast_change
     if state.phase == APPROACH:
         p, v, a, low = approach_step(
             config, path, state, dt, x, gap, radius_ball, radius_tip, gap_std
         )
-        if low or force_z - state.tare > config.touch_force:
+        if low or force_z - state.tare > config.approach.touch_force:
             return TaskState(ROLL, t, state.p, state.v, state.a, feel=strays, **sight)
         return replace(state, p=p, v=v, a=a)
     above = 0.0 if landed is not None else approach_height(config, gap_std)
-    over = t - state.since_sec >= config.reposition_sec * state.stretch - 0.5 * dt
+    over = t - state.since_sec >= config.reposition.sec * state.stretch - 0.5 * dt
     if state.since_sec < t and (over if landed is None else landed):
         feel = landed is None and gap_std > 0.0
         feel &= (
-            max(gap_std / config.land_above, state.strayed / config.coast_change) > 1
+            max(gap_std / config.land.above, state.strayed / config.land.coast_change)
+            > 1
         )
         if above > 0.0 or feel:
             return replace(state, phase=APPROACH, since_sec=t, tare=force_z, feel=feel)
