@@ -92,7 +92,8 @@ SAME_FIGURES = {
     },
     "position error after five trials": {
         LAB: rf"contacts after five trials \|.*?\| {N} mm, perfect",
-        "docs/lab/contacts_measured.md": rf"after 1, 3, 5 trials \|.*\| [\d.]+ / [\d.]+ / {N} mm",
+        "docs/lab/contacts_measured.md": rf"after 1, 3, 5 trials \|.*\| [\d.]+ / "
+        rf"[\d.]+ / {N} mm",
     },
     "porridge: fixed, incremental, no model": {
         LAB: rf"porridge, prediction.*\| {N}; {N}; {N} N \|",
