@@ -1,16 +1,33 @@
 """Logs as MCAP: read back by another library, their times and values are the log's."""
 
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from effect_scenes import double, on_ground
+from pydrake.geometry import (
+    Box,
+    Capsule,
+    Convex,
+    Cylinder,
+    Ellipsoid,
+    HalfSpace,
+    Mesh,
+    Sphere,
+)
 from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.gap.data.bags import read_bag
 from makebreak.gap.data.reading import read_recording
 from makebreak.gap.data.table import write_recording
-from makebreak.gap.report.mcap_file import motions_of, write_mcap, write_rrd
+from makebreak.gap.report.mcap_file import (
+    _primitives,
+    motions_of,
+    write_mcap,
+    write_rrd,
+)
+from makebreak.models.meshes import write_obj
 from makebreak.models.scene import load_scene
 from makebreak.models.scene_file import write_scene
 from makebreak.scripts import cli
@@ -116,7 +133,43 @@ def test_bodies_are_where_the_joints_put_them_and_shapes_go_with_them(tmp_path):
     assert shapes.markers and all(m.frame_locked for m in shapes.markers)
 
 
-def test_free_bodies_and_all_kinds_of_shapes(tmp_path):
+def signed_volume(corners):
+    """Of closed triangles (3 n, 3) that all face outwards [m3]."""
+    a, b, c = corners.reshape(-1, 3, 3).transpose(1, 0, 2)
+    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
+
+
+def test_each_kind_of_shape_is_drawn_in_its_size(tmp_path):
+    wedge = write_obj(
+        np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3.0]]),
+        np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]),
+    )
+    for shape in (Mesh(str(wedge), 0.5), Convex(str(wedge), 0.5)):
+        ((kind, _, scale, corners),) = _primitives(shape)
+        assert kind == "TRIANGLE_LIST" and list(scale) == [1.0, 1.0, 1.0]
+        np.testing.assert_allclose(corners.max(axis=0), [0.5, 1.0, 1.5])
+        assert signed_volume(corners) == pytest.approx(0.125)  # 1/6 of 0.5 x 1 x 1.5.
+    sizes = {
+        Box(1.0, 2.0, 3.0): [("CUBE", [1, 2, 3], 0.0)],
+        Sphere(0.5): [("SPHERE", [1, 1, 1], 0.0)],
+        Ellipsoid(1.0, 2.0, 3.0): [("SPHERE", [2, 4, 6], 0.0)],
+        Cylinder(0.5, 3.0): [("CYLINDER", [1, 1, 3], 0.0)],
+        Capsule(0.5, 3.0): [
+            ("CYLINDER", [1, 1, 3], 0.0),
+            ("SPHERE", [1, 1, 1], -1.5),
+            ("SPHERE", [1, 1, 1], 1.5),
+        ],
+        HalfSpace(): [],
+    }
+    for shape, expected in sizes.items():
+        got = [
+            (kind, list(scale), X.translation()[2])
+            for kind, X, scale, _ in _primitives(shape)
+        ]
+        assert got == expected
+
+
+def test_a_free_body_moves_with_its_shapes(tmp_path):
     rows = {f"b.box.{c}": 0.0 * TIME for c in ("qx", "qy", "qz")}
     rows |= {"b.box.qw": 0.0 * TIME + 1.0, "b.box.x": Q[:, 0], "b.box.y": 0.0 * TIME}
     rows |= {"b.box.z": 0.0 * TIME + 0.05, "b.box.vx": Q[:, 1]}
@@ -199,6 +252,12 @@ def test_a_missing_library_and_an_unknown_format_are_said_in_a_line(
     words += [str(tmp_path / "out"), "--to"]
     assert cli.main([*words, "avi"]) == 2
     assert "--to: got 'avi', expected some of mcap, rrd" in capsys.readouterr().err
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "rosbags.rosbag2", None)
+        assert cli.main([*words, "mcap"]) == 2
+        said = "log.mcap: MCAP needs rosbags: pip install 'makebreak[ros]'"
+        assert said in capsys.readouterr().err
+        assert not (tmp_path / "out" / "log.mcap").exists()
     command = "makebreak.scripts.cli.convert_command"
     monkeypatch.setattr(f"{command}.find_spec", lambda name: None)
     assert cli.main([*words, "rrd"]) == 2
