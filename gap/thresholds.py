@@ -72,7 +72,7 @@ EXTRA_PARAMETERS_MAX = 1
 # other, or if the error of one is at most this many times that of the other.
 RIVAL_ERROR_RATIO = 1.3
 # Deviations off neutral that an effect must be, with its rival free, to be needed
-# beside it. Set on 17 pushes (docs/gap_method.md, "Mass or friction").
+# beside it. Set on 17 pushes (docs/gap_contact.md, "Mass or friction").
 NEEDED_Z = 5.0
 # Both of two rivals are named only if the second takes this share off the held-out
 # error that the first one leaves (the same pushes).
