@@ -10,6 +10,7 @@ from makebreak.benchmarks.c3_light import problem_at, row
 from makebreak.benchmarks.plants import OF_MASS, diagram_of, held_box
 from makebreak.systems.contact_mpc.lcs_builder import AnitescuLcs
 from makebreak.systems.contact_mpc.numerics.c3_active_set import MET, solve_active
+from makebreak.systems.contact_mpc.numerics.c3_admm import compiled_once
 from makebreak.systems.contact_mpc.numerics.c3_bounds import within
 from makebreak.systems.contact_mpc.numerics.c3_interior import (
     IPM_STARTS,
@@ -73,6 +74,8 @@ def test_the_interior_point_method_agrees_with_the_active_set_in_any_units():
         h = weight * rng.normal(size=(N + 1, n)) / units
         AB = units[n_v:, None] * np.hstack([B, A]) / units
         lower, upper, x0 = lower * units, upper * units, motion[0] * units[n_v:]
+        # Read-only where qp_step's are: what may be written is compiled by itself.
+        T_N, upper = compiled_once(T_N), compiled_once(upper)
         fac = new_factor(AB[None], np.zeros((1, n_x)), N)
         assert factor(fac, T[None], T_N, np.zeros((0, 0)), 0)
         x, v = np.empty((N + 1, n_x)), np.empty((N, n_v))

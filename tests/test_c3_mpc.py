@@ -147,8 +147,8 @@ def random_qp(rng, bounded=False):
         if i < n_v and rng.random() < 0.1:
             lower[i] = upper[i] = 0.3  # A fixed value.
     x0 = rng.normal(size=n_x)
-    # Read-only as C3Problem's: what may be written is compiled by itself.
-    T_N, lower, upper = map(compiled_once, (L_N @ L_N.T, lower, upper))
+    # Read-only where qp_step's are: what may be written is compiled by itself.
+    T_N, upper = map(compiled_once, (L_N @ L_N.T, upper))
     return A, B, d, T, T_N, h, x0, v0, lower, upper
 
 
@@ -674,7 +674,7 @@ def test_many_active_bounds_agree_with_the_interior_point_method():
     x, v = np.empty((N + 1, n_x)), np.empty((N, n_v))
     solve(fac, h, x0, np.empty(0), x, v)
     upper = compiled_once(np.r_[np.inf, 0.3, 0.3, np.full(n_x, np.inf)])
-    lower = compiled_once(-upper)
+    lower = -upper
     found = []
     for method in (solve_active, solve_interior):
         ours = x.copy(), v.copy()

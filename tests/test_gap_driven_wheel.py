@@ -169,7 +169,9 @@ def problem_of(files: tuple[Path, Path]) -> ContactProblem:
     return PressingProblem(read, split(recordings).decided)
 
 
-@pytest.mark.parametrize(("mass", "gain"), [(1.3, 1.0), (1.0, 1.3)])
+@pytest.mark.parametrize(
+    ("mass", "gain"), [(1.3, 1.0), pytest.param(1.0, 1.3, marks=pytest.mark.slow)]
+)
 def test_a_carts_mass_and_its_motors_gain_are_a_tie(tmp_path, mass, gain):
     """Nothing but torque and motion is measured. One was named alone: noise was weighed
     as that of the lighter cart, or two masses were taken at once, of which one went."""

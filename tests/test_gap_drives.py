@@ -92,8 +92,10 @@ def rms(r):
 
 @pytest.mark.parametrize(
     "drive, hidden",
-    [(drive, hidden) for drive in ACTUATION for hidden in HIDDEN
-     if (drive, hidden) != ("velocity", "gain")],
+    [("servo", hidden) for hidden in HIDDEN]
+    + [("velocity", "load and more")]
+    + [pytest.param("velocity", hidden, marks=pytest.mark.slow)
+       for hidden in ("nothing", "load", "direction")],
 )  # fmt: skip
 def test_equations_of_driven_joints_are_met_by_the_truth_alone(tmp_path, drive, hidden):
     effects = HIDDEN[hidden]

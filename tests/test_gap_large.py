@@ -429,7 +429,10 @@ def test_in_a_right_bowl_nothing_is_found(tmp_path, scene, seed):
 # ----- A ball in a bowl
 
 
-@pytest.fixture(scope="module", params=["bowl_fine", "bowl_mesh"])
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param("bowl_fine", marks=pytest.mark.slow), "bowl_mesh"],
+)
 def bowl(request, tmp_path_factory):
     """Its folder, and the model of a right bowl of plates, or of a mesh."""
     folder = tmp_path_factory.mktemp(request.param)

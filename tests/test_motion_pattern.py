@@ -20,7 +20,12 @@ from makebreak.systems.changing_contact.numerics.motion_pattern import (
     save_pattern,
     segment_time,
 )
-from makebreak.systems.changing_contact.numerics.path_geometry import path_point
+from makebreak.systems.changing_contact.numerics.path_geometry import (
+    last_parameter,
+    length_to,
+    path_point,
+    place,
+)
 
 PATTERNS = Path(__file__).resolve().parent.parent / "models" / "patterns"
 DOWN, LEFT = [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]
@@ -36,6 +41,17 @@ def turned(degrees, axis=(0.0, 0.0, 1.0)):
 
 def one(kind, positions, times=(0.0, 4.0), **more):
     return MotionPattern((Segment(kind, positions, times, **more),))
+
+
+@pytest.mark.parametrize("kind, points", [("arc", POINTS[:3]), ("spline", POINTS)])
+def test_a_place_is_where_the_path_is_at_its_length(kind, points):
+    table = one(kind, points).table
+    lengths = []
+    for w in np.linspace(0.0, last_parameter(table, 0) + 0.05, 60):
+        lengths.append(length_to(table, 0, w))
+        expected = path_point(table, 0, lengths[-1])[0, :3]
+        np.testing.assert_allclose(place(table, 0, w)[:3], expected, atol=1e-13)
+    assert (np.diff(lengths) > 0.0).all() and lengths[0] == 0.0
 
 
 def shapes():

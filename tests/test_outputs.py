@@ -342,7 +342,9 @@ def test_gap_on_a_full_disk_keeps_the_result_and_the_scene(real_gap):
     assert json.loads(Path("g1/result.json").read_text())["effects"]
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize(
+    "number", [signal.SIGTERM, pytest.param(signal.SIGHUP, marks=pytest.mark.slow)]
+)
 def test_gap_ends_with_what_it_has_when_it_is_told_to(real_gap, number):
     process = start(*real_gap, "--out", "g1")
     assert process.stderr is not None

@@ -14,6 +14,8 @@ from pathlib import Path
 
 import pytest
 
+from makebreak.systems.numerics.code_cache import user_cache
+
 ROOT = Path(__file__).resolve().parent.parent
 ROOMS = ("models", "systems", "diagrams", "gap", "scripts")
 # A user's file: what is right in it, and after each `#` what a type checker must say.
@@ -136,7 +138,7 @@ def check_complaints(found):
 
 
 def test_a_type_checker_knows_what_the_package_offers(tmp_path):
-    config, cache = ROOT / "pyproject.toml", ROOT / ".mypy_cache"  # test_code.py's.
+    config, cache = ROOT / "pyproject.toml", user_cache() / "mypy"  # test_code.py's.
     options = (f"--config-file={config}", f"--cache-dir={cache}")
     check_complaints(complaints(sys.executable, tmp_path, *options, MYPYPATH=str(ROOT)))
 

@@ -374,7 +374,12 @@ def test_scale_and_its_slopes():
 
 @pytest.mark.parametrize(
     "true",
-    [{"mass": 6.0}, {"mass": 1.5}, {"gap": 0.015}, {"gap": -0.012, "mass": 4.5}],
+    [
+        pytest.param({"mass": 6.0}, marks=pytest.mark.slow),
+        pytest.param({"mass": 1.5}, marks=pytest.mark.slow),
+        {"gap": 0.015},
+        {"gap": -0.012, "mass": 4.5},
+    ],
     ids=str,
 )
 def test_a_leg_learns_its_mass_and_where_the_ground_is(true):

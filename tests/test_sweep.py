@@ -79,26 +79,26 @@ def test_bad_ranges_are_one_line_and_status_2(vary, message, capsys):
 
 
 def test_a_sweep_writes_table_rows_and_plots(capsys):
-    args = ["sweep", "spring_mass", "--trials", "3", "--set", "steps=800"]
+    args = ["sweep", "spring_mass", "--trials", "2", "--set", "steps=800"]
     args += ["--vary", "noise=0.0:0.1", "damped=true,false", "--jobs", "2"]
     args += ["--out", "out"]
     assert cli.main(args) == 0
     shown = capsys.readouterr().out
-    low, high = wilson(3, 3)
-    assert f"3 of 3, {100 * low:.0f}-{100 * high:.0f} %" in shown
+    low, high = wilson(2, 2)
+    assert f"2 of 2, {100 * low:.0f}-{100 * high:.0f} %" in shown
     rows = rows_of("out/sweep.csv")
     assert (
-        len(rows) == 6 and [r["damped"] for r in rows] == ["True"] * 3 + ["False"] * 3
+        len(rows) == 4 and [r["damped"] for r in rows] == ["True"] * 2 + ["False"] * 2
     )
     runs = Sweep("spring_mass", apply_settings(spring_mass.Config(), ["steps=800"]),
-                 ["noise=0.0:0.1", "damped=true,false"], 3).runs()  # fmt: skip
+                 ["noise=0.0:0.1", "damped=true,false"], 2).runs()  # fmt: skip
     for row, (settings, seed) in zip(rows, runs, strict=True):
         own = spring_mass.Config(**settings, seed=seed)
         assert float(row["noise"]) == own.noise and int(row["seed"]) == seed
         if own.damped:
             assert row["success"] == "True"
     summary = json.loads(Path("out/sweep.json").read_text())
-    assert [case["success"]["of"] for case in summary["cases"]] == [3, 3]
+    assert [case["success"]["of"] for case in summary["cases"]] == [2, 2]
     # What was not measured: "-" in the table, null or an empty cell in the files.
     assert "nan" not in shown + Path("out/sweep.md").read_text()
     page = Path("out/report.html").read_text()

@@ -11,6 +11,7 @@ from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 from scipy.spatial.transform import Rotation
 
 from makebreak.systems.changing_contact.numerics.contact_regions import (
+    REGIONS,
     REGIONS_MAX,
     expected,
 )
@@ -42,6 +43,7 @@ from makebreak.systems.changing_contact.numerics.motion_pattern import (
     Segment,
     load_pattern,
 )
+from makebreak.systems.changing_contact.numerics.path_geometry import path_point
 from makebreak.systems.changing_contact.numerics.shaped_reference import pose_output
 from makebreak.systems.changing_contact.numerics.shaper_memory import N_MEMORY
 from makebreak.systems.changing_contact.numerics.velocity_shaper import plan, tick
@@ -547,6 +549,33 @@ def test_a_contact_that_the_path_does_not_approach_has_no_region():
     log = follow(LINE, belief)
     np.testing.assert_array_equal(log.p, follow(LINE, ContactBelief()).p)
     assert set(log.kind) == {NO_CONTACT}
+
+
+@pytest.mark.parametrize(
+    "kind, points",
+    [
+        ("arc", [[0.5, 0.2, 0.1], [0.55, 0.1, 0.1], [0.5, 0.0, 0.1]]),
+        ("spline", [[0.5, 0.2, 0.1], [0.5, 0.1, 0.12], [0.4, 0.0, 0.05]]),
+    ],
+)
+def test_a_region_on_a_bent_path_reaches_as_far_from_the_contact_as_on_a_line(
+    kind, points
+):
+    pattern = MotionPattern((Segment(kind, points, (0.0, 4.0)),))
+    for share in (0.4, 0.6, 0.8):
+        at = path_point(pattern.table, 0, share * pattern.length(0))
+        mean, d = at[0, :3], at[1, :3]
+        belief = ContactBelief((contact(mean, d, 0, sigma=0.004),))
+        memory = np.zeros(N_MEMORY)
+        regions = plan(pattern.table, LAW, memory, 0.0, expected(belief))
+        region = regions.view(REGIONS)[0]["rows"][0]
+        half = LAW.sigmas * 0.004 + LAW.margin
+        for s, off in (
+            (region["entry"], -half - V_A * LAW.settle_sec),
+            (region["leave"], half),
+        ):
+            found = (path_point(pattern.table, 0, s)[0, :3] - mean) @ d
+            assert found == pytest.approx(off, abs=1e-9)
 
 
 # --- The system.

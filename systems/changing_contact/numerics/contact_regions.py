@@ -33,7 +33,10 @@ from makebreak.systems.changing_contact.numerics.path_geometry import (
     all_finite,
     dot,
     head,
+    last_parameter,
+    length_to,
     path_point,
+    place,
 )
 
 REGIONS_MAX = 32
@@ -136,9 +139,8 @@ def extent_on(table, region, k):
 
 
 @numba.njit(cache=True)
-def _gap(table, k, s, mean, d, shift):
-    """How far the path at s is beyond the plane through mean with normal d [m]."""
-    p = path_point(table, k, s)[0]
+def _gap(p, mean, d, shift):
+    """How far p is beyond the plane through mean with normal d [m]."""
     return dot(p, d) - dot(mean, d) + shift
 
 
@@ -146,21 +148,21 @@ def _gap(table, k, s, mean, d, shift):
 def _crossing(table, law, k, mean, d, shift, before, after):
     """Arc lengths at which the path is `before` in front of the plane through mean
     with normal d, and `after` behind it; inf, inf where it does not cross it."""
-    L = head(table, k, LENGTH)
     if head(table, k, KIND) == LINE:
-        slope = dot(path_point(table, k, 0.0)[1], d)
+        start = path_point(table, k, 0.0)
+        slope = dot(start[1], d)
         if slope < 0.05:
             return np.inf, np.inf
-        s = -_gap(table, k, 0.0, mean, d, shift) / slope
+        s = -_gap(start[0], mean, d, shift) / slope
         return s - before / slope, s + after / slope
     n = 256
-    end = L + law.search_max
+    width = (last_parameter(table, k) + law.search_max) / n
     values = np.empty(n + 1)
     best, nearest = -1, np.inf
     for i in range(n + 1):
-        values[i] = _gap(table, k, i * end / n, mean, d, shift)
+        p = place(table, k, i * width)
+        values[i] = _gap(p, mean, d, shift)
         if i > 0 and values[i - 1] < 0.0 <= values[i]:
-            p = path_point(table, k, i * end / n)[0]
             add_along(p, mean, -1.0)
             add_along(p, d, -dot(p, d))
             across = dot(p, p)
@@ -171,23 +173,24 @@ def _crossing(table, law, k, mean, d, shift, before, after):
     entry, leave = -1.0, np.inf
     for i in range(best, 0, -1):
         if values[i - 1] <= -before < values[i]:
-            entry = _root(table, k, mean, d, shift + before, i - 1, i, end / n)
+            entry = _root(table, k, mean, d, shift + before, i * width, width)
             break
     for i in range(best, n + 1):
         if values[i - 1] < after <= values[i]:
-            leave = _root(table, k, mean, d, shift - after, i - 1, i, end / n)
+            leave = _root(table, k, mean, d, shift - after, i * width, width)
             break
     return entry, leave
 
 
 @numba.njit(cache=True)
-def _root(table, k, mean, d, shift, i, j, width):
-    """The arc length between i and j widths at which the path crosses the plane."""
-    low, high = i * width, j * width
+def _root(table, k, mean, d, shift, high, width):
+    """The arc length at which the path crosses the plane, at a parameter (of `place`)
+    from `width` below `high` to it."""
+    low = high - width
     for _ in range(40):
         middle = 0.5 * (low + high)
-        if _gap(table, k, middle, mean, d, shift) < 0.0:
+        if _gap(place(table, k, middle), mean, d, shift) < 0.0:
             low = middle
         else:
             high = middle
-    return high
+    return length_to(table, k, high)

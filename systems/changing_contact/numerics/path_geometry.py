@@ -166,6 +166,54 @@ def path_point(table, segment, s):
 
 
 @numba.njit(cache=True)
+def last_parameter(table, segment):
+    """The parameter of `place` at the end of an arc or a spline."""
+    if int(table[1 + segment * HEAD + KIND]) == ARC:
+        return head(table, segment, LENGTH)
+    return table[int(head(table, segment, DATA))]
+
+
+@numba.njit(cache=True)
+def place(table, segment, w):
+    """Position [m], the first three of (6,), on an arc or a spline at a parameter that
+    needs no arc length to be inverted, 200 times as quick there as path_point.
+
+    Args: w: on an arc, arc length [m]; on a spline of m spans, the spans from its start
+        (2.5: in the middle of the third), and beyond its end m + the way from there
+        [m]; at least 0.
+    """
+    m = last_parameter(table, segment)
+    if int(head(table, segment, KIND)) == ARC:
+        return path_point(table, segment, w)[0]
+    if w >= m:
+        return path_point(table, segment, head(table, segment, LENGTH) + w - m)[0]
+    at, x = _in_span(table, segment, w)
+    return _polynomial(table, at, x, 0)
+
+
+@numba.njit(cache=True)
+def length_to(table, segment, w):
+    """Arc length [m] from the start to the parameter w of `place`."""
+    m = last_parameter(table, segment)
+    if int(head(table, segment, KIND)) == ARC:
+        return w
+    if w >= m:
+        return head(table, segment, LENGTH) + w - m
+    at, x = _in_span(table, segment, w)
+    s0 = int(head(table, segment, DATA)) + 2 + int(m)
+    return table[s0 + int(w)] + _length_of_u(table, at, x)
+
+
+@numba.njit(cache=True)
+def _in_span(table, segment, w):
+    """Where the polynomial of a spline's span is in the table, and u from its start."""
+    at, span = int(head(table, segment, DATA)), int(w)
+    u0 = at + 1 + span
+    coefficients = at + 3 + 2 * int(table[at])
+    return coefficients + 48 * span, (w - span) * (table[u0 + 1] - table[u0])
+
+
+@numba.njit(cache=True)
 def largest_curvature(table, segment):
     """Of the position along `segment` [1/m], among BENDS_AT of its points."""
     length, most = table[1 + segment * HEAD + LENGTH], 0.0

@@ -99,18 +99,8 @@ def factor(fac, costs, T_N, diagonal, n_fixed):
                     for j in range(i, n):
                         W[i, j] += a * Z[m, j]
         # Cholesky over v leaves the Schur complement of x, which is P_k.
-        start = n_fixed if k == 0 else 0
-        for j in range(start, n_v):
-            pivot = W[j, j]
-            if not pivot > 1e-13 * abs(T[j, j]):
-                return False
-            inverse = 1.0 / np.sqrt(pivot)
-            for i in range(j, n):
-                W[j, i] *= inverse
-            for i in range(j + 1, n):
-                a = W[j, i]
-                for m in range(i, n):
-                    W[i, m] -= a * W[j, m]
+        if not _eliminate(W, T, n_fixed if k == 0 else 0, n_v):
+            return False
         for i in range(n_v):
             for j in range(i, n):
                 S[k, i, j] = W[i, j]
@@ -118,6 +108,42 @@ def factor(fac, costs, T_N, diagonal, n_fixed):
             for j in range(i, n_x):
                 P[k, i, j] = W[n_v + i, n_v + j]
                 P[k, j, i] = P[k, i, j]
+    return True
+
+
+@njit(cache=True)
+def _eliminate(W, T, start, end):
+    """Cholesky's steps of the pivots start to end - 1 on the upper half of W (n, n), in
+    place; False if W is not positive definite there, by the size of T (n, n).
+
+    Four pivots at a time, so that the rows below are read and written once for four.
+    """
+    n, j = W.shape[0], start
+    while j < end:
+        n_block = min(4, end - j)
+        for i in range(j, j + n_block):
+            for b in range(j, i):
+                a = W[b, i]
+                for m in range(i, n):
+                    W[i, m] -= a * W[b, m]
+            pivot = W[i, i]
+            if not pivot > 1e-13 * abs(T[i, i]):
+                return False
+            inverse = 1.0 / np.sqrt(pivot)
+            for m in range(i, n):
+                W[i, m] *= inverse
+        for i in range(j + n_block, n):
+            if n_block == 4:
+                a0, a1, a2, a3 = W[j, i], W[j + 1, i], W[j + 2, i], W[j + 3, i]
+                for m in range(i, n):
+                    less = W[i, m] - a0 * W[j, m] - a1 * W[j + 1, m]
+                    W[i, m] = less - a2 * W[j + 2, m] - a3 * W[j + 3, m]
+            else:
+                for b in range(j, j + n_block):
+                    a = W[b, i]
+                    for m in range(i, n):
+                        W[i, m] -= a * W[b, m]
+        j += n_block
     return True
 
 
