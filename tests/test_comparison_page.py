@@ -290,6 +290,7 @@ def test_what_stands_still_does_not_hide_what_moves(at):
 
 
 def test_what_the_page_shows_is_written_as_mcap_too(tmp_path):
+    from mcap.reader import make_reader
     from test_mcap_file import messages  # Skips without the libraries.
 
     scene, recordings = swung(tmp_path, "servo")
@@ -301,6 +302,12 @@ def test_what_the_page_shows_is_written_as_mcap_too(tmp_path):
     result = replace(result, effects=[named])
     assert write_comparison(result, scene, recordings, tmp_path / "c.mcap") == []
     found = messages(tmp_path / "c.mcap")
+    with open(tmp_path / "c.mcap", "rb") as file:
+        stamps = [
+            message.log_time
+            for _, _, message in make_reader(file).iter_messages(log_time_order=False)
+        ]
+    assert stamps == sorted(stamps)  # A player reads it as it is written.
     [series] = result.series
     for who in ("measured", "before", "after"):
         times, states = found[f"/{who}/joint_states"]

@@ -104,6 +104,7 @@ def write_mcap(
 
             for k, (motion, start) in enumerate(zip(motions, starts, strict=True)):
                 stamps = np.rint(1e9 * (motion.time + start)).astype(np.int64)
+                parts: list = []
                 for who, columns in motion.columns.items():
                     if who not in loaded:
                         continue
@@ -113,12 +114,10 @@ def write_mcap(
                         shapes = _shapes(one, before, COLOURS[who])
                         array = messages.shapes(shapes, who, int(stamps[0]))
                         write(f"/{before}shapes", int(stamps[0]), array)
-                    parts = [
-                        *messages.readings(columns, stamps, before, one.plant),
-                        *messages.poses(columns, stamps, before, one.plant, motion),
-                    ]
-                    for stamp, topic, message in sorted(parts, key=lambda p: p[0]):
-                        write(topic, stamp, message)
+                    parts += messages.readings(columns, stamps, before)
+                    parts += messages.poses(columns, stamps, before, one.plant, motion)
+                for stamp, topic, message in sorted(parts, key=lambda part: part[0]):
+                    write(topic, stamp, message)
         (written,) = bag.glob("*.mcap")
         shutil.move(written, path)
     return notes
@@ -214,9 +213,7 @@ class _Messages:
             self._quaternion(wxyz),
         )  # fmt: skip
 
-    def readings(
-        self, columns: Mapping, stamps: np.ndarray, before: str, plant: MultibodyPlant
-    ) -> Iterator:
+    def readings(self, columns: Mapping, stamps: np.ndarray, before: str) -> Iterator:
         """(stamp, topic, message) of each row that has samples."""
         for topic, quantities in (
             ("joint_states", _STATE),
