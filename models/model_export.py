@@ -154,6 +154,15 @@ def _own_file(scene: Scene, model: str, suffix: str) -> Exported:
     return Exported(document.toxml() + "\n", tuple(omitted))
 
 
+def formats_of(scene: Scene) -> list[str]:
+    """Of urdf, sdf and mjcf those in which the scene's mechanism can be written."""
+    try:
+        _load(scene)
+    except ValueError:  # It has a body that moves freely.
+        return []
+    return [k for k in ("urdf", "sdf") if models_of(scene, f".{k}")] + ["mjcf"]
+
+
 def models_of(scene: Scene, suffix: str) -> dict[str, Path]:
     """{model: its file} of the models that come from such files (.urdf or .sdf)."""
     parser = Parser(MultibodyPlant(0.0))

@@ -14,7 +14,7 @@ from pydrake.systems.framework import DiagramBuilder
 from makebreak.gap.simulation.commands import Commands
 from makebreak.gap.simulation.scene_simulation import SceneSimulation
 from makebreak.models.effects.kind import Effect
-from makebreak.models.model_export import to_mjcf, to_urdf
+from makebreak.models.model_export import formats_of, to_mjcf, to_urdf
 from makebreak.models.scene import ActuationSection, load_scene
 from makebreak.models.scene_schema import SupplySection
 from makebreak.scripts.cli.gap_command import exported
@@ -261,6 +261,17 @@ def test_what_a_format_cannot_say_is_told(tmp_path):
         to_mjcf(on_ground(tmp_path, "cube"))
     with pytest.raises(ValueError, match="'q' comes from no URDF"):
         to_urdf(scene, "q")
+
+
+def test_what_is_offered_can_be_written(tmp_path):
+    scene = double(tmp_path)
+    assert formats_of(scene) == ["urdf", "mjcf"]
+    assert exported(scene, formats_of(scene))
+    (tmp_path / "d.sdf").write_text(SDF)
+    scene.directives[0].add_model.file = f"file://{tmp_path / 'd.sdf'}"
+    assert formats_of(scene) == ["sdf", "mjcf"]
+    assert exported(scene, formats_of(scene))
+    assert formats_of(on_ground(tmp_path, "cube")) == []
 
 
 def test_the_command_writes_what_is_asked_for(tmp_path):

@@ -20,6 +20,7 @@ from makebreak.gap.report.pictures import (
 )
 from makebreak.gap.result import GapResult
 from makebreak.models.effects.kind import Effect
+from makebreak.models.model_export import formats_of
 from makebreak.models.scene import Scene
 from makebreak.models.scene_file import write_scene
 
@@ -58,8 +59,9 @@ def write_report(
             repaired = replace(scene, effects=[*scene.effects, *added])
             write_scene(repaired, files[-1], heading, place)
         page = report_html(
-            shown, drawn, place, scene_path, recordings, comparison is not None
-        )
+            shown, drawn, place, scene_path, recordings, comparison is not None,
+            formats_of(scene),
+        )  # fmt: skip
         _write(out / "report.html", page)
         # What would be missed least comes last, should the disk be full.
         for name, png in drawn.items():

@@ -28,11 +28,13 @@ def report_html(
     scene_path: str | Path = "SCENE.yaml",
     recordings: Sequence[Recording] = (),
     has_comparison: bool = False,
+    formats: Sequence[str] = (),
 ) -> str:
     """The report as one HTML page, pictures inside.
 
-    Args: pictures: PNG files by name. out: the folder where the page will be. The
-        others: as of files.write_report.
+    Args: pictures: PNG files by name. out: the folder where the page will be.
+        formats: in which the repaired model can be written. The others: as of
+        files.write_report.
     """
     heading, _ = heading_of(result)
     first = _first_screen(result, pictures, has_comparison)
@@ -48,7 +50,9 @@ def report_html(
         sections.checks(result),
         sections.background(result),
         sections.channels(result),
-        sections.next_steps(result, out, scene_path, recordings, has_comparison),
+        sections.next_steps(
+            result, out, scene_path, recordings, has_comparison, formats
+        ),
         sections.seconds(result),
     ]
     return (

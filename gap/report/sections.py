@@ -339,6 +339,7 @@ def next_steps(
     scene_path: str | Path,
     recordings: Sequence[Recording],
     has_comparison: bool,
+    formats: Sequence[str],
 ) -> str:
     """Commands to go on with. Arguments: as of page.report_html."""
     scene = quote(str(out / "scene.yaml"))
@@ -351,8 +352,9 @@ def next_steps(
     if result.effects:
         left = f"makebreak gap {scene} {tables}"
         lines.append(("Is there a gap left in the repaired model?", left))
-        export = f"{again} --export urdf,mjcf"
-        lines.append(("The repaired model for other simulators:", export))
+        if formats:
+            export = f"{again} --export {','.join(formats)}"
+            lines.append(("The repaired model for other simulators:", export))
     lines.append(("This comparison again:", f"{again} --out {quote(str(out))}"))
     body = "".join(
         f"<p class=small>{escape(says)}</p><pre>{escape(line)}</pre>"
