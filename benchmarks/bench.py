@@ -30,8 +30,9 @@ BENCHES: dict[str, str] = {
     "c3_light": "makebreak.benchmarks.c3_light",
     "learner_plants": "makebreak.benchmarks.learner_plants",
     "parameter_learner": "makebreak.benchmarks.parameter_learner",
+    "parameter_push": "makebreak.benchmarks.parameter_push",
 }
-NAMED_ONLY = ("c3_light", "learner_plants", "parameter_learner")
+NAMED_ONLY = ("c3_light", "learner_plants", "parameter_learner", "parameter_push")
 
 
 def median_call_ms(

@@ -34,13 +34,16 @@ from makebreak.diagrams.ball_rolling_config import (
     BallRollingConfig,
     c3_config,
     controller_model,
+    learned_parameters,
     learner_config,
     paper_learner_config,
+    parameter_learner_config,
     what_goes_wrong,
     world_scene,
 )
 from makebreak.diagrams.camera import camera_model
 from makebreak.diagrams.faults import faulty_lcs
+from makebreak.diagrams.learned_parameters import add_gap_std, add_parameter_learner
 from makebreak.diagrams.realism import draw_errors
 from makebreak.diagrams.recorder import record_station
 from makebreak.diagrams.sampled_contacts import (
@@ -90,6 +93,7 @@ from makebreak.systems.contact_mpc.lcs_builder import (
     LcsBuilderConfig,
 )
 from makebreak.systems.contact_mpc.numerics.ball_state import N_X, P_BALL
+from makebreak.systems.contact_mpc.parameter_learner import ParameterLearner
 from makebreak.systems.contact_mpc.path_target import PathTargetConfig
 from makebreak.systems.contact_mpc.residual_learner import ResidualLearner
 from makebreak.systems.contact_mpc.rolling_task import RollingTask
@@ -220,7 +224,8 @@ def add_ball_rolling(
     tip = arm.GetFrameByName(TIP_FRAME)
     p_tip = tip.CalcPoseInWorld(arm.CreateDefaultContext()).translation()
 
-    lcs, lcs_of = _add_models(builder, config, model)
+    items = learned_parameters(config)
+    lcs, lcs_of = _add_models(builder, config, model, items)
     n_lam = lcs_of["plan"].n_lam
     estimator = _add_sensing(builder, config, model, station, arm)
     task: LeafSystem
@@ -286,7 +291,23 @@ def add_ball_rolling(
             connect(sliders, "gap", one, "gap")
     if learner_kind in ("r_dyn", "both"):
         lcs_port |= _add_dynamics_residual(builder, lcs, lcs_of, estimator)
-    if learner_kind in ("r_comp", "both"):
+    if items:
+        learner = ParameterLearner(
+            make_tip_and_ball(model)[0],
+            parameter_learner_config(
+                config, _pairs(config.planner.friction, ContactPair().tangent), items
+            ),
+            LEARN,
+            OFFSET["learner"],
+        )
+        r_comp = add_parameter_learner(
+            builder, learner, estimator, "window_valid", [lcs["plan"], lcs["command"]],
+            N_TIP, LEARN,
+        )  # fmt: skip
+        builder.Connect(
+            add_gap_std(builder, learner, LEARN), task.GetInputPort("r_std")
+        )
+    elif learner_kind in ("r_comp", "both"):
         r_comp = _add_learner(builder, config, lcs, lcs_of, estimator, task)
         if meshcat is not None:
             button = builder.AddNamedSystem("adapt_button", AdaptButton(n_lam, meshcat))
@@ -376,20 +397,21 @@ def _refuse_unused(config: BallRollingConfig) -> None:
         refuse_unused(config, plain, name, why)
     if config.controller == "paper":
         refuse_unused(config, plain, "learning", "not used with controller=paper")
+    if not (config.adapt and config.learner == "parameters"):
+        why = "used with learner=parameters alone"
+        refuse_unused(config, plain, "parameters", why)
 
 
 def _add_models(
-    builder: DiagramBuilder, config: BallRollingConfig, model
+    builder: DiagramBuilder, config: BallRollingConfig, model, items
 ) -> tuple[dict[str, LeafSystem], dict[str, AnitescuLcs]]:
     """The three LCS: as systems, and what they build with."""
     friction, tangent = config.planner.friction, ContactPair().tangent
     if config.contact_sequence == "sampled":
         # Edges along the vertical do not jump as the normal goes around the ball.
         friction, tangent = config.contacts.planner.friction, [0.0, 0.0, 1.0]
-    pairs = [
-        ContactPair("tip::tip", "ball::ball", friction, tangent=tangent),
-        ContactPair("ball::ball", "table::table", friction),
-    ]
+    pairs = _pairs(friction, tangent)
+    planned = [item for item in items if item.kind != "gap"]
     lcs, lcs_of = {}, {}
     for name, dt, period in (
         ("plan", PLAN_DT, CONTROL),
@@ -398,11 +420,20 @@ def _add_models(
     ):
         own = AnitescuLcsBuilder(
             make_tip_and_ball(model)[0],
-            LcsBuilderConfig(pairs, dt, None, period, OFFSET["lcs"]),
+            LcsBuilderConfig(
+                pairs, dt, None, period, OFFSET["lcs"], parameters=planned
+            ),
         )
         lcs_of[name] = own.model
         lcs[name] = builder.AddNamedSystem(f"lcs_{name}", own)
     return lcs, lcs_of
+
+
+def _pairs(friction: float, tangent) -> list[ContactPair]:
+    return [
+        ContactPair("tip::tip", "ball::ball", friction, tangent=tangent),
+        ContactPair("ball::ball", "table::table", friction),
+    ]
 
 
 def _mean_of_tip(

@@ -20,6 +20,8 @@ from makebreak.models.scene import Scene, load_scene, read_scene
 from makebreak.models.tip_and_ball import TipAndBall
 from makebreak.systems.arm.impedance_controller import ImpedanceConfig
 from makebreak.systems.contact_mpc.c3_mpc import C3Config
+from makebreak.systems.contact_mpc.lcs_builder import ContactPair
+from makebreak.systems.contact_mpc.multibody.model_parameters import Parameter
 from makebreak.systems.contact_mpc.numerics.ball_state import (
     N_X,
     P_BALL,
@@ -35,6 +37,7 @@ from makebreak.systems.contact_mpc.numerics.c3_projections import (
     PlusProjection,
     QpProjection,
 )
+from makebreak.systems.contact_mpc.parameter_learner import ParameterLearnerConfig
 from makebreak.systems.contact_mpc.residual_learner import (
     PosteriorConfig,
     ResidualLearnerConfig,
@@ -101,6 +104,22 @@ class LearnerConfig:
 
 
 @dataclass
+class RollingParametersConfig:
+    """What learner=parameters learns, and how well the model knows it: standard
+    deviations; 0: not learned. The weights are those of `learning`."""
+
+    # Deviation of the logarithm of the ball's mass.
+    mass: float = 0.5
+    # Deviation of the logarithm of the friction of tip and ball, and of ball and table.
+    friction: float = 0.5
+    # Deviation of the lever arm of the ball's rolling resistance on the table [m].
+    rolling: float = 3e-4
+    gap: float = 0.005  # Deviation of the distance of tip and ball [m].
+    # Deviation of the gap speed of a closed contact [m/s].
+    contact_std: float = 0.02
+
+
+@dataclass
 class BallRollingConfig:
     """All settings of a run.
 
@@ -109,9 +128,10 @@ class BallRollingConfig:
     """
 
     adapt: bool = True  # Whether a residual is learned; false: as learner=none.
-    # Residual that is learned: r_comp (of the contact equation), r_dyn (of the
-    # dynamics, eq. 10), both or none.
-    learner: Literal["none", "r_comp", "r_dyn", "both"] = "r_comp"
+    # What is learned: the residual r_comp (of the contact equation), r_dyn (of the
+    # dynamics, eq. 10), both; parameters (mass, friction, rolling resistance and gap;
+    # settings parameters); or none.
+    learner: Literal["none", "r_comp", "r_dyn", "both", "parameters"] = "r_comp"
     # Learner and projection: ours, or paper: those of the paper, with its constants.
     controller: Literal["ours", "paper"] = "ours"
     # What decides when and where to touch: cycle (the hand-written RollingTask;
@@ -155,6 +175,7 @@ class BallRollingConfig:
     task: RollingTaskConfig = field(default_factory=RollingTaskConfig)
     planner: PlannerConfig = field(default_factory=PlannerConfig)
     learning: LearnerConfig = field(default_factory=LearnerConfig)
+    parameters: RollingParametersConfig = field(default_factory=RollingParametersConfig)
     contacts: SampledContactsConfig = field(default_factory=SampledContactsConfig)
     impedance: ImpedanceConfig = field(
         default_factory=lambda: ImpedanceConfig(force_max=20.0)
@@ -335,6 +356,43 @@ def learner_config(
         r_max=learner.r_max,
         slip_noise=learner.slip_noise,
         posterior=posterior,
+    )
+
+
+def learned_parameters(config: BallRollingConfig) -> list[Parameter]:
+    """Those of learner=parameters. Raises: ValueError for none, or one below 0."""
+    if not config.adapt or config.learner != "parameters":
+        return []
+    own = config.parameters
+    for name in ("mass", "friction", "rolling", "gap"):
+        if not getattr(own, name) >= 0.0:
+            raise ValueError(
+                f"parameters.{name} is {getattr(own, name)}, expected >= 0"
+            )
+    items = [
+        Parameter("mass", own.mass, "ball"),
+        Parameter("friction", own.friction, pairs=[0]),
+        Parameter("friction", own.friction, pairs=[1]),
+        Parameter("rolling", own.rolling, pairs=[1]),
+        Parameter("gap", own.gap, pairs=[0]),
+    ]
+    learned = [item for item in items if item.std > 0.0]
+    if not learned:
+        raise ValueError("parameters has no deviation above 0, expected one to learn")
+    return learned
+
+
+def parameter_learner_config(
+    config: BallRollingConfig, pairs: list[ContactPair], items: list[Parameter]
+) -> ParameterLearnerConfig:
+    """The weights are those of the residual's learner."""
+    of_residual = learner_config(config.learning)
+    return ParameterLearnerConfig(
+        pairs,
+        items,
+        of_residual.Q_d,
+        config.parameters.contact_std,
+        slip_noise=config.learning.slip_noise,
     )
 
 

@@ -24,7 +24,8 @@ class ContactMpcConfig:
     # Weights of the state [1/SI^2], (n_x,), and of the input [1/N^2], (n_u,).
     Q: list[float] = field(default_factory=list)
     R: list[float] = field(default_factory=list)
-    x_desired: list[float] = field(default_factory=list)  # (n_x,) [SI]
+    # (n_x,) [SI]; empty: the input port x_desired has the goal of each knot.
+    x_desired: list[float] = field(default_factory=list)
     dt_sec: float = 0.05  # Between the knots of a plan [s].
     period_sec: float = 0.0125  # Between two plans [s].
     options: C3Options = field(
@@ -37,6 +38,10 @@ class ContactMpcConfig:
     lcs_along_plan: bool = False
     # Those that a ParameterLearner learns; the plan is for its values of them.
     parameters: list[Parameter] = field(default_factory=list)
+    # (n_x,) weights of the state at the plan's end, None: Q; (N, n_x) at the knots
+    # before it, in place of Q.
+    Q_N: list[float] | None = None
+    Q_knots: list[list[float]] | None = None
 
 
 def make_contact_mpc(model: Diagram, config: ContactMpcConfig) -> Diagram:
@@ -44,7 +49,9 @@ def make_contact_mpc(model: Diagram, config: ContactMpcConfig) -> Diagram:
 
     Inputs:  x (n_x,), the state [q, v] of the model's plant; r_comp (n_lam,),
              optional, of a ResidualLearner whose period is dt_sec; parameters (n,),
-             with config.parameters only, of a ParameterLearner.
+             with config.parameters only, of a ParameterLearner; x_desired
+             ((N + 1) n_x,), without config.x_desired only: where the state is to be at
+             each knot, dt_sec apart, row by row.
     Outputs: u (n_u,) [N, N m]; status (1,), a C3Status; plan, a Plan (abstract); lcs,
              what the plan is for (abstract; a tuple with lcs_along_plan), about the x
              of each multiple of period_sec.
@@ -82,7 +89,7 @@ def make_contact_mpc(model: Diagram, config: ContactMpcConfig) -> Diagram:
             raise ValueError(
                 f"ContactMpcConfig.{name} has {len(values)} entries, expected {n}"
             )
-    if len(c.x_desired) != n_x:
+    if c.x_desired and len(c.x_desired) != n_x:
         raise ValueError(
             f"ContactMpcConfig.x_desired has {len(c.x_desired)} entries, expected "
             f"{n_x}: {lcs.model.x_names}"
@@ -91,7 +98,11 @@ def make_contact_mpc(model: Diagram, config: ContactMpcConfig) -> Diagram:
     # two steps, x and u hardly.
     G = np.repeat([0.01, 1.0, 0.01, 1.0], [n_x, n_lam, n_u, n_lam])
     U = np.repeat([1.0, 1.0, 1.0, 10.0], [n_x, n_lam, n_u, n_lam])
-    weights = C3Weights(np.array(c.Q), np.array(c.R), G, U)
+    weights = C3Weights(
+        np.array(c.Q), np.array(c.R), G, U,
+        Q_N=None if c.Q_N is None else np.array(c.Q_N),
+        Q_knots=None if c.Q_knots is None else np.array(c.Q_knots),
+    )  # fmt: skip
     c3 = builder.AddNamedSystem(
         "c3",
         C3Mpc(
@@ -102,12 +113,15 @@ def make_contact_mpc(model: Diagram, config: ContactMpcConfig) -> Diagram:
             offset_sec=1e-4,  # After the builder, so that the LCS is about this state.
         ),
     )
-    goal = builder.AddSystem(
-        ConstantVectorSource(np.tile(c.x_desired, c.options.N + 1))
-    )
+    if c.x_desired:
+        goal = builder.AddSystem(
+            ConstantVectorSource(np.tile(c.x_desired, c.options.N + 1))
+        )
+        builder.Connect(goal.get_output_port(), c3.GetInputPort("x_desired"))
+    else:
+        builder.ExportInput(c3.GetInputPort("x_desired"), "x_desired")
     no_force = builder.AddSystem(ConstantVectorSource(np.zeros(n_u)))
     builder.Connect(no_force.get_output_port(), lcs.GetInputPort("u"))
-    builder.Connect(goal.get_output_port(), c3.GetInputPort("x_desired"))
     builder.Connect(lcs.GetOutputPort("lcs"), c3.GetInputPort("lcs"))
     if c.lcs_along_plan:
         builder.Connect(c3.GetOutputPort("plan"), lcs.GetInputPort("plan"))

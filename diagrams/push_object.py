@@ -7,6 +7,8 @@
     contact_sampler --command (where to touch)--> push_task
     pose_sensor, state_estimator --> past_state --> lcs_learn, residual_learner
     residual_learner --r_comp--> c3_mpc, contact_sampler
+    or past_state --> parameter_learner --parameters--> lcs_plan, lcs_command,
+        contact_sampler (but the gap, which goes the way of r_comp)
     c3_mpc (contact), push_task (travel) --> arm_reference
     gentle: state_estimator --tip_force--> touch_down --touch_speed--> arm_reference
     arm_reference --> impedance_controller --tau--> station
@@ -27,11 +29,13 @@ from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 from makebreak.diagrams import wiring
 from makebreak.diagrams.camera import camera_model
 from makebreak.diagrams.fault_kinds import read_faults
+from makebreak.diagrams.learned_parameters import add_parameter_learner
 from makebreak.diagrams.push_object_config import (
     ARM_TICK,
     CONTROL,
     ESTIMATE,
     LEARN,
+    N_TIP,
     OBJECT,
     OFFSET,
     PLAN_DT,
@@ -42,7 +46,9 @@ from makebreak.diagrams.push_object_config import (
     PushObjectConfig,
     c3_config,
     contact_pairs,
+    learned_parameters,
     learner_config,
+    parameter_learner_config,
     past_config,
     rolling_axis,
 )
@@ -97,11 +103,13 @@ from makebreak.systems.contact_mpc.lcs_builder import (
     AnitescuLcsBuilder,
     LcsBuilderConfig,
 )
+from makebreak.systems.contact_mpc.multibody.model_parameters import Parameter
 from makebreak.systems.contact_mpc.numerics.c3_mpc import C3Problem
 from makebreak.systems.contact_mpc.numerics.contact_sampling import (
     ObjectShape,
     SamplingConfig,
 )
+from makebreak.systems.contact_mpc.parameter_learner import ParameterLearner
 from makebreak.systems.contact_mpc.push_goals import PushGoals
 from makebreak.systems.contact_mpc.push_task import PushTask
 from makebreak.systems.contact_mpc.residual_learner import ResidualLearner
@@ -150,18 +158,34 @@ def make_push_object(
     builder = DiagramBuilder()
     model = _make_model(config)
     station = _add_station(builder, config, meshcat)
-    lcs = _add_lcs_builders(builder, model)
+    items = learned_parameters(config)
+    lcs = _add_lcs_builders(builder, model, [p for p in items if p.kind != "gap"])
     sensor, estimator = _add_sensing(builder, config, model, station)
     planning = _add_planning(builder, config, model, lcs)
     reference, impedance = _add_arm_control(builder, config, model, planning, lcs)
     _connect_estimates(builder, station, sensor, estimator)
     past = estimator
-    if config.adapt and sensor.HasOutputPort("readings"):
+    learns = config.adapt and config.learner != "none"
+    if learns and sensor.HasOutputPort("readings"):
         past = _add_past_state(builder, config, model, sensor, estimator)
     _connect_lcs_builders(builder, lcs, estimator, past)
-    if config.adapt:
-        learner = _add_learner(builder, config, lcs["learn"], past, estimator)
-        r_comp = _switchable(builder, learner.GetOutputPort("r_comp"), meshcat)
+    if learns:
+        if items:
+            users = [lcs["plan"], lcs["command"], planning.sampler]
+            pairs = contact_pairs(model.spec, model.friction)
+            parameter_learner = ParameterLearner(
+                make_tip_and_object(model.spec, model.tip)[0],
+                parameter_learner_config(config.parameters, pairs, items),
+                LEARN,
+                OFFSET["learner"],
+            )
+            ready = "window_valid" if past is estimator else "ready"
+            r_comp = add_parameter_learner(
+                builder, parameter_learner, past, ready, users, N_TIP, LEARN
+            )
+        else:
+            learner = _add_learner(builder, config, lcs["learn"], past, estimator)
+            r_comp = _switchable(builder, learner.GetOutputPort("r_comp"), meshcat)
         for system in (planning.c3, planning.sampler):
             builder.Connect(r_comp, system.GetInputPort("r_comp"))
     _connect_planning(builder, planning, lcs, estimator)
@@ -214,6 +238,10 @@ def _refuse_unused(config: PushObjectConfig) -> None:
     for name in unused:
         why = f"not used with pose_from={config.pose_from}"
         refuse_unused(config, plain, name, why)
+    learner = config.learner if config.adapt else "none"
+    if learner != "parameters":
+        why = f"not used with learner={learner}"
+        refuse_unused(config, plain, "parameters", why)
     if not config.gentle:
         refuse_unused(config, plain, "touch", "not used with gentle=false")
     if not rolling_axis(config.object):
@@ -270,7 +298,7 @@ def _add_station(builder: DiagramBuilder, config: PushObjectConfig, meshcat) -> 
 
 
 def _add_lcs_builders(
-    builder: DiagramBuilder, model: _Model
+    builder: DiagramBuilder, model: _Model, items: list[Parameter]
 ) -> dict[str, AnitescuLcsBuilder]:
     """The contact model for planning, for the command between knots, for learning."""
     pairs = contact_pairs(model.spec, model.friction)
@@ -284,7 +312,9 @@ def _add_lcs_builders(
             f"lcs_{name}",
             AnitescuLcsBuilder(
                 make_tip_and_object(model.spec, model.tip)[0],
-                LcsBuilderConfig(pairs, dt, None, period, OFFSET["lcs"]),
+                LcsBuilderConfig(
+                    pairs, dt, None, period, OFFSET["lcs"], parameters=items
+                ),
             ),
         )
     return added

@@ -19,12 +19,14 @@ from makebreak.systems.changing_contact.touch_down import TouchDownConfig
 from makebreak.systems.contact_mpc.c3_mpc import C3Config
 from makebreak.systems.contact_mpc.contact_sampler import ContactSamplerConfig
 from makebreak.systems.contact_mpc.lcs_builder import ContactPair
+from makebreak.systems.contact_mpc.multibody.model_parameters import Parameter
 from makebreak.systems.contact_mpc.numerics.ball_state import (
     N_X,
     P_BALL,
     Q_BALL,
     V_BALL,
     V_TIP,
+    W_BALL,
     plus_weights,
 )
 from makebreak.systems.contact_mpc.numerics.c3_mpc import (
@@ -33,6 +35,7 @@ from makebreak.systems.contact_mpc.numerics.c3_mpc import (
     OrientationWeight,
 )
 from makebreak.systems.contact_mpc.numerics.contact_sampling import SamplingConfig
+from makebreak.systems.contact_mpc.parameter_learner import ParameterLearnerConfig
 from makebreak.systems.contact_mpc.push_goals import PushGoalsConfig
 from makebreak.systems.contact_mpc.push_task import PushTaskConfig
 from makebreak.systems.contact_mpc.residual_learner import (
@@ -125,6 +128,28 @@ class PushLearnerConfig:
 
 
 @dataclass
+class PushParametersConfig:
+    """What learner=parameters learns, and how well the model knows it: standard
+    deviations; 0: not learned."""
+
+    mass: float = 0.5  # Deviation of the logarithm of the object's mass.
+    # Deviation of the logarithm of the friction of tip and object, and of object and
+    # table.
+    friction: float = 0.5
+    gap: float = 0.004  # Deviation of the distance of tip and object [m].
+    # Deviation of the object's centre of mass along x and along y [m].
+    com: float = 0.0
+    # Weights Q_d of the velocities along x and y of tip and object [s2/m2].
+    weight: float = 4e3
+    # Radius at which the object's turning counts with the same weight [m].
+    turn_radius: float = 0.05
+    # Deviation of the gap speed of a closed contact [m/s].
+    contact_std: float = 0.02
+    # Noise of the measured sliding speed, times the friction [m/s].
+    slip_noise: float = 0.02
+
+
+@dataclass
 class PushModelConfig:
     """In what the controllers' model differs from the world."""
 
@@ -144,8 +169,10 @@ class PushModelConfig:
 class PushObjectConfig:
     """World and model start from the same object; `model` holds the model's errors."""
 
-    # Whether the residual of the contact of tip and object is learned.
-    adapt: bool = True
+    adapt: bool = True  # Whether anything is learned; false: as learner=none.
+    # What is learned: r_comp (residual of the contact of tip and object), parameters
+    # (mass, friction and gap; settings parameters), or none.
+    learner: Literal["none", "r_comp", "parameters"] = "r_comp"
     object: PushedObject = field(default_factory=PushedObject)
     # Coefficient of friction of the object with tip and table in the world.
     friction: float = 0.5
@@ -173,6 +200,7 @@ class PushObjectConfig:
     task: PushTaskConfig = field(default_factory=PushTaskConfig)
     planner: PushPlannerConfig = field(default_factory=PushPlannerConfig)
     learning: PushLearnerConfig = field(default_factory=PushLearnerConfig)
+    parameters: PushParametersConfig = field(default_factory=PushParametersConfig)
     # Whether the speed before a touch is learned, and reduced where a touch is
     # expected.
     gentle: bool = False
@@ -270,6 +298,47 @@ def learner_config(learner: PushLearnerConfig, late: bool) -> ResidualLearnerCon
         r_max=learner.r_max,
         slip_noise=learner.slip_noise,
         posterior=learner.posterior,
+    )
+
+
+def learned_parameters(config: PushObjectConfig) -> list[Parameter]:
+    """Those of learner=parameters; the pairs are those of contact_pairs.
+
+    Raises: ValueError for none, or a negative deviation.
+    """
+    if not config.adapt or config.learner != "parameters":
+        return []
+    own = config.parameters
+    for name in ("mass", "friction", "gap", "com"):
+        if not getattr(own, name) >= 0.0:
+            raise ValueError(
+                f"parameters.{name} is {getattr(own, name)}, expected >= 0"
+            )
+    n = len(support_spheres(config.object)[0])
+    table = list(range(1, n + 1))
+    items = [
+        Parameter("mass", own.mass, OBJECT),
+        Parameter("com_x", own.com, OBJECT),
+        Parameter("com_y", own.com, OBJECT),
+        Parameter("friction", own.friction, pairs=[0]),
+        Parameter("friction", own.friction, pairs=table),
+        Parameter("gap", own.gap, pairs=[0]),
+    ]
+    learned = [item for item in items if item.std > 0.0]
+    if not learned:
+        raise ValueError("parameters has no deviation above 0, expected one to learn")
+    return learned
+
+
+def parameter_learner_config(
+    own: PushParametersConfig, pairs: list[ContactPair], items: list[Parameter]
+) -> ParameterLearnerConfig:
+    Q_d = np.zeros(N_X)
+    for part in (V_TIP, V_BALL):
+        Q_d[part.start : part.start + 2] = own.weight
+    Q_d[W_BALL.start + 2] = own.weight * own.turn_radius**2
+    return ParameterLearnerConfig(
+        pairs, items, Q_d.tolist(), own.contact_std, slip_noise=own.slip_noise
     )
 
 

@@ -60,6 +60,9 @@ if TYPE_CHECKING:
         StewartTrinkle as StewartTrinkle,
     )
     from makebreak.systems.contact_mpc.lcs_plant import LcsPlant as LcsPlant
+    from makebreak.systems.contact_mpc.numerics.c3_linear import (
+        LinearBound as LinearBound,
+    )
     from makebreak.systems.contact_mpc.numerics.c3_mpc import (
         C3Bounds as C3Bounds,
         C3Options as C3Options,

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -30,6 +31,7 @@ from makebreak.diagrams.ball_rolling_config import (
     world_scene,
 )
 from makebreak.diagrams.camera import CameraConfig
+from makebreak.diagrams.learned_parameters import what_was_learned
 from makebreak.diagrams.scene_facts import sphere_radius
 from makebreak.diagrams.station import MODELS, make_control_plant
 from makebreak.models.scene import load_scene
@@ -42,6 +44,7 @@ from makebreak.systems.contact_mpc.numerics.c3_projections import (
     PlusProjection,
     QpProjection,
 )
+from makebreak.systems.contact_mpc.numerics.parameter_posterior import Belief
 from makebreak.systems.contact_mpc.numerics.rolling_task import (
     ROLL,
     WAIT,
@@ -731,6 +734,31 @@ def test_bad_settings_are_one_line_and_no_traceback(tmp_path, capfd, setting, me
     lines = capfd.readouterr().err.splitlines()
     assert len(lines) == 1 and lines[0].startswith("makebreak: ")
     assert message in lines[0]
+
+
+def test_the_learner_of_parameters_is_wired_and_runs():
+    diagram = make_ball_rolling(config(learner="parameters", seed=1))
+    learner = diagram.GetSubsystemByName("parameter_learner")
+    names = learner.model.parameters.names
+    assert names == [
+        "mass of ball", "friction of pairs [0]", "friction of pairs [1]",
+        "rolling of pairs [1]", "gap of pairs [0]",
+    ]  # fmt: skip
+    context = diagram.CreateDefaultContext()
+    its = learner.GetMyContextFromRoot(context)
+    sure = Belief(np.array([0.0, 0.0, 0.0, 0.5, 1.0]), 1e8 * np.eye(5))
+    its.SetAbstractState(0, replace(learner._memory_of(its), belief=sure))
+
+    def read(name, port):
+        system = diagram.GetSubsystemByName(name)
+        return system.GetInputPort(port).Eval(system.GetMyContextFromRoot(context))
+
+    np.testing.assert_allclose(read("lcs_plan", "parameters")[3], 1.5e-4, rtol=1e-6)
+    np.testing.assert_allclose(read("rolling_task", "r_comp")[:4], 0.1, rtol=1e-6)
+    np.testing.assert_allclose(read("rolling_task", "r_std"), [1e-4 * 0.1], rtol=1e-6)
+    assert what_was_learned(diagram, context)["learned_gap_of_pairs_0"] == (
+        pytest.approx(0.005)
+    )
 
 
 @pytest.mark.parametrize("learner", ["none", "r_dyn", "both"])

@@ -40,6 +40,7 @@ from makebreak.systems.contact_mpc.numerics.c3_admm import (
 )
 from makebreak.systems.contact_mpc.numerics.c3_bounds import solve_bounded, within
 from makebreak.systems.contact_mpc.numerics.c3_interior import solve_interior
+from makebreak.systems.contact_mpc.numerics.c3_linear import LinearBound
 from makebreak.systems.contact_mpc.numerics.c3_mpc import (
     C3Bounds,
     C3Options,
@@ -600,6 +601,96 @@ def test_a_bound_is_not_met_by_a_contact_that_pulls(projection):
         x_upper=np.array([np.inf, x0[1] + 0.05, np.inf, np.inf]),
     )
     assert plan.lam.min() >= 0.0 and plan.x[1:, 1].max() <= x0[1] + 0.05 + 1e-6
+
+
+@pytest.mark.parametrize("projection", [PLUS, C3_QP, EXACT])
+def test_a_linear_bound_on_one_state_is_the_bound_of_that_state(projection):
+    lcs, x0, x_desired = cartpole_lcs(), CARTPOLE["x0"], np.zeros((6, 4))
+    free, _ = solve_c3(lcs, x0, x_desired, cartpole_problem(projection))
+    v_max = 0.5 * (x0[2] + free.x[1:, 2].max())
+    of_state = C3Bounds(x_upper=np.array([np.inf, np.inf, v_max, np.inf]))
+    row = LinearBound(x=np.array([0.0, 0.0, 2.0, 0.0]), upper=2.0 * v_max)
+    plans = [
+        solve_c3(lcs, x0, x_desired, cartpole_problem(projection, bounds))[0]
+        for bounds in (of_state, C3Bounds(linear=[row]))
+    ]
+    assert plans[1].x.shape == plans[0].x.shape
+    for name in ("x", "u", "lam"):
+        np.testing.assert_allclose(*(getattr(p, name) for p in plans), atol=1e-6)
+
+
+def test_a_linear_bound_on_forces_and_one_of_input_and_speed_hold():
+    """A finger pushes a puck with at most 2 N along the normal, and a motor that gives
+    less the faster it turns."""
+    plant, _ = AddMultibodyPlantSceneGraph(builder := DiagramBuilder(), 0.0)
+    Parser(plant).AddModels(str(model_path("puck.sdf")))
+    plant.Finalize()
+    model = AnitescuLcs(builder.Build(), [ContactPair("finger", "puck", 0.3)], 0.05)
+    lcs = model.build(x0 := model.x_default, np.zeros(model.n_u))
+    n = lcs.n_x + 2 * lcs.n_lam + lcs.n_u
+    weights = C3Weights(
+        np.array([0.0, 200.0, 1.0, 20.0]), np.array([0.01]), np.ones(n), np.ones(n)
+    )
+    x_desired = np.tile([0.4, 0.5, 0.0, 0.0], (21, 1))
+
+    def solved(*linear):
+        problem = C3Problem(
+            weights, PLUS, C3Options(N=20, rounds=5), C3Bounds(linear=list(linear))
+        )
+        return solve_c3(lcs, x0, x_desired, problem)
+
+    on_force = LinearBound(lam=np.ones(lcs.n_lam), upper=2.0)
+    on_both = LinearBound(u=np.ones(1), x=np.array([0.0, 0.0, 5.0, 0.0]), upper=3.0)
+    free, warm = solved()
+    assert free.lam.sum(axis=1).max() > 3.0
+    assert (free.u[:, 0] + 5.0 * free.x[1:, 2]).max() > 3.5
+    plan, _ = solved(on_force)
+    assert plan.lam.sum(axis=1).max() == pytest.approx(2.0, abs=1e-5)
+    plan, again = solved(on_force, on_both)
+    assert plan.lam.sum(axis=1).max() <= 2.0 + 1e-5
+    most = (plan.u[:, 0] + 5.0 * plan.x[1:, 2]).max()
+    assert most == pytest.approx(3.0, abs=1e-5)
+    step = plan.x[:-1] @ lcs.A.T + plan.u @ lcs.B.T + plan.lam @ lcs.D.T + lcs.d
+    np.testing.assert_allclose(plan.x[1:], step, atol=1e-9)
+    assert again.delta.shape == warm.delta.shape
+
+
+def test_linear_bounds_of_a_wrong_size_are_refused():
+    for row, said in (
+        (LinearBound(u=np.ones(2)), "LinearBound 0: u is .* expected 1 finite"),
+        (LinearBound(x=np.full(4, np.nan)), "LinearBound 0: x is"),
+        (LinearBound(u=np.ones(1), lower=1.0, upper=0.0), "expected lower <= upper"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            cartpole_problem(PLUS, C3Bounds(linear=[row]))
+
+
+@pytest.mark.parametrize("projection", [PLUS, C3_QP])
+def test_weights_of_knots_are_those_of_each_knot(projection):
+    lcs, x0 = cartpole_lcs(), CARTPOLE["x0"]
+    problem = cartpole_problem(projection)
+    Q, N = np.diag(problem.Q), problem.options.N
+
+    def solved(x_desired, **more):
+        given = C3Weights(Q, problem.R, problem.G, problem.U, problem.Q_N, **more)
+        other = C3Problem(given, projection, problem.options)
+        return solve_c3(lcs, x0, x_desired, other)[0], other
+
+    to_zero = np.zeros((N + 1, 4))
+    plain, _ = solved(to_zero)
+    same, _ = solved(to_zero, Q_knots=np.tile(Q, (N, 1)))
+    np.testing.assert_allclose(same.u, plain.u, atol=1e-12)
+    # A knot without weight may have any target.
+    weights, target = np.tile(Q, (N, 1)), to_zero.copy()
+    weights[3], target[3] = 0.0, 7.0
+    free, other = solved(to_zero, Q_knots=weights)
+    moved, _ = solved(target, Q_knots=weights)
+    np.testing.assert_allclose(moved.u, free.u, atol=1e-12)
+    assert abs(solved(target)[0].u - plain.u).max() > 1e-3
+    of_free = plan_cost(lcs, x0, free.u, target, other)
+    assert of_free == pytest.approx(plan_cost(lcs, x0, free.u, to_zero, other))
+    with pytest.raises(ValueError, match=r"Q_knots is \(1, 4\).*expected \(5, 4\)"):
+        solved(to_zero, Q_knots=weights[:1])
 
 
 def plan_exists(lcs, x0, problem):

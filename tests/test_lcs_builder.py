@@ -1454,3 +1454,34 @@ def test_a_learned_gap_is_planned_with_as_if_it_were_modelled(dt):
     # Both spheres on one line: only the constant of the gap differs.
     assert planned(text, np.full(4, 8e-3 / dt)) == pytest.approx(expected, abs=1e-6)
     assert abs(planned(text) - expected) > 1e-2
+
+
+def test_a_goal_that_moves_is_the_goal_of_each_knot():
+    """Without x_desired in the config a port has it; a goal that stands still is that
+    of the config, and weights of knots act where they are."""
+    text = Path(model_path("puck.sdf")).read_text()
+
+    def planned(goal=None, **more):
+        c = ContactMpcConfig(
+            [ContactPair("finger", "puck", 0.3)], Q=[0, 200, 1, 20], R=[0.01],
+            x_desired=[] if goal is not None else [0.4, 0.5, 0, 0], **more,
+        )  # fmt: skip
+        mpc = make_contact_mpc(diagram_of(text), c)
+        simulator = Simulator(mpc)
+        context = simulator.get_mutable_context()
+        mpc.GetInputPort("x").FixValue(context, [0.09, 0.0, 0.3, 0.0])
+        if goal is not None:
+            mpc.GetInputPort("x_desired").FixValue(context, np.ravel(goal))
+        simulator.AdvanceTo(1e-3)
+        return mpc.GetOutputPort("u").Eval(context)[0]
+
+    still = np.tile([0.4, 0.5, 0.0, 0.0], (11, 1))
+    expected = planned()
+    assert planned(still) == pytest.approx(expected, abs=1e-9)
+    later = still.copy()
+    later[1:, 1] += 0.1 * np.arange(10)
+    assert planned(later) > expected + 0.1
+    # The same as a goal that stands still, if the knots where it moves have no weight.
+    only_end = {"Q_knots": np.zeros((10, 4)).tolist(), "Q_N": [0, 200, 1, 20]}
+    later[-1] = still[-1]
+    assert planned(later, **only_end) == pytest.approx(planned(still, **only_end))

@@ -22,6 +22,7 @@ from makebreak.diagrams.push_object import (
     PushObjectConfig,
     make_push_object,
 )
+from makebreak.diagrams.push_object_config import PushParametersConfig
 from makebreak.diagrams.push_object_scenes import (
     model_object,
     model_scene,
@@ -34,6 +35,7 @@ from makebreak.models.scene import read_scene
 from makebreak.models.scene_file import write_scene
 from makebreak.systems.changing_contact.touch_down import TouchDownConfig
 from makebreak.systems.contact_mpc.numerics.ball_state import N_X, P_BALL, Q_BALL
+from makebreak.systems.contact_mpc.numerics.parameter_posterior import Belief
 from makebreak.systems.contact_mpc.numerics.push_task import (
     CONTACT,
     TRAVEL,
@@ -514,9 +516,53 @@ def test_a_gentle_touch_is_wired_and_its_speed_is_checked(gentle):
             )
 
 
+def test_what_the_learner_of_parameters_knows_is_planned_with():
+    """Mass and frictions go to both models and to the sampler, the gap as r_comp."""
+    diagram = make_push_object(PushObjectConfig(learner="parameters"))
+    assert not diagram.HasSubsystemNamed("residual_learner")
+    context = diagram.CreateDefaultContext()
+
+    def own(name):
+        system = diagram.GetSubsystemByName(name)
+        return system, system.GetMyContextFromRoot(context)
+
+    learner, its = own("parameter_learner")
+    assert [p.kind for p in learner.model.parameters.items] == [
+        "mass", "friction", "friction", "gap",
+    ]  # fmt: skip
+    sure = Belief(np.array([1.0, -1.0, 0.5, 2.0]), 1e8 * np.eye(4))
+    its.SetAbstractState(0, replace(learner._memory_of(its), belief=sure))
+    expected = [0.4 * np.exp(0.5), 0.5 * np.exp(-0.5), 0.5 * np.exp(0.25)]
+    for name in ("lcs_plan", "lcs_command", "contact_sampler"):
+        system, its = own(name)
+        values = system.GetInputPort("parameters").Eval(its)
+        np.testing.assert_allclose(values, expected, rtol=1e-6)
+    for name in ("c3_mpc", "contact_sampler"):
+        system, its = own(name)
+        r_comp = system.GetInputPort("r_comp").Eval(its)
+        np.testing.assert_allclose(r_comp[:4], 0.008 / 0.05, rtol=1e-6)
+        assert not r_comp[4:].any()
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"mass": -0.1}, "parameters.mass is -0.1, expected >= 0"),
+        ({"mass": 0.0, "friction": 0.0, "gap": 0.0}, "parameters has no deviation"),
+    ],
+)
+def test_nothing_to_learn_is_refused(settings, said):
+    config = PushObjectConfig(
+        learner="parameters", parameters=PushParametersConfig(**settings)
+    )
+    with pytest.raises(ValueError, match=said):
+        make_push_object(config)
+
+
 @pytest.mark.parametrize(
     ("choice", "setting", "value"),
     [
+        ({"learner": "r_comp"}, "parameters.mass", 0.7),
         ({"pose_from": "sensor"}, "camera.width", 160),
         ({"pose_from": "sensor"}, "tracker.yaw_std", 0.02),
         ({"pose_from": "sensor"}, "learning.weight_late", 100.0),

@@ -13,6 +13,7 @@ from makebreak.diagrams.ball_rolling_config import (
 )
 from makebreak.diagrams.fault_kinds import read_fault
 from makebreak.diagrams.lcm_station import make_lcm_station
+from makebreak.diagrams.learned_parameters import what_was_learned
 from makebreak.diagrams.recorder import recorded
 from makebreak.diagrams.replay_station import joint_columns, make_replay_station
 from makebreak.diagrams.station import TIP_FRAME, TORQUE_RATE_MAX, make_control_plant
@@ -76,6 +77,10 @@ def run(config, session):
         learner = system("residual_learner")
         record["loss"] = learner.GetOutputPort("loss")
         record["r_std"] = learner.GetOutputPort("r_std")
+    if diagram.HasSubsystemNamed("parameter_learner"):
+        learner = system("parameter_learner")
+        record["loss"] = learner.GetOutputPort("loss")
+        record["r_std"] = system("learned_std").get_output_port()
     at = plant.GetBodyByName("ball").floating_positions_start() + 4
     center = np.array(config.task.center)
     progress = Progress(center, config.task.radius)
@@ -93,6 +98,7 @@ def run(config, session):
     track = ground_truth(config, log, plant)
     contact = contact_truth(config, diagram, log, plant)
     result = score(config, log, track, contact)
+    result |= what_was_learned(diagram, log.context)
     torque = system("torque_log").FindLog(log.context).data()
     result["torque_peak_Nm"] = float(abs(torque).max())
     at_limit = abs(np.diff(torque, axis=1)) >= TORQUE_RATE_MAX * 1e-3 * (1.0 - 1e-9)

@@ -9,6 +9,7 @@ from scipy.signal import lfilter
 from scipy.spatial import ConvexHull
 
 from makebreak.diagrams.camera import describe_camera
+from makebreak.diagrams.learned_parameters import what_was_learned
 from makebreak.diagrams.push_object import READING_COLUMNS, make_push_object
 from makebreak.diagrams.push_object_config import (
     LEARN,
@@ -134,6 +135,8 @@ def run(config, session):
     height = plant.GetBodyByName(OBJECT).floating_positions_start() + 6
     if diagram.HasSubsystemNamed("residual_learner"):
         ports["r"] = system("residual_learner").GetOutputPort("r_comp")
+    if diagram.HasSubsystemNamed("parameter_learner"):
+        ports["r"] = system("learned_residual").get_output_port()
 
     def done(t, sample) -> str:
         if sample["state"][height] < FALLEN:
@@ -253,6 +256,7 @@ def score(config, diagram, log, truth, goals):
         "seed": config.seed,
         "adapt": config.adapt,
         "shape": config.object.shape,
+        **what_was_learned(diagram, log.context),
     }
 
 

@@ -1,7 +1,9 @@
 """The system that chooses where to touch next (numerics/contact_sampling.py)."""
 
+from collections.abc import Sized
 from dataclasses import dataclass, field
 from enum import IntEnum
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -44,7 +46,10 @@ class Model(Protocol):
     dt_sec: float
     x_default: np.ndarray
 
-    def build_many(self, x, u) -> tuple[np.ndarray, ...]: ...
+    @property
+    def parameters(self) -> Sized: ...
+
+    def build_many(self, x, u, parameters=None) -> tuple[np.ndarray, ...]: ...
 
 
 @dataclass
@@ -72,7 +77,8 @@ class ContactSampler(LeafSystem):
              0.5 if the object is seen; r_comp (n_lam,) [m/s], optional: the learned
              residual, used in every plan. Where it says that the object reaches farther
              than modelled, the places lie farther out (with sampling.follow they also
-             lie nearer where it reaches less far).
+             lie nearer where it reaches less far). parameters (n,), if the model has
+             parameters, optional: their values for every plan.
     Outputs: command (3,) = [number, x, y]: a place in the object's frame, seen from
              above [m]. A new number is a new command to move there; 0: none yet;
              status (1,): a SamplerStatus; round (abstract): the last Round, or ().
@@ -111,6 +117,8 @@ class ContactSampler(LeafSystem):
         self._phase = self.DeclareVectorInputPort("phase", 1)
         self._valid = self.DeclareVectorInputPort("valid", 1)
         self._r_comp = self.DeclareVectorInputPort("r_comp", p.n_lam)
+        n = len(model.parameters)
+        self._parameters = self.DeclareVectorInputPort("parameters", n) if n else None
         self._memory = self.DeclareAbstractState(Value[object](SamplingMemory()))
         # Not None, which Drake 1.58 cannot hold.
         self._round = self.DeclareAbstractState(Value[object](()))
@@ -146,6 +154,12 @@ class ContactSampler(LeafSystem):
             return SamplerStatus.NOT_FINITE
         if not valid[0] > 0.5:
             return SamplerStatus.NOT_SEEN
+        build_many = self._model.build_many
+        if self._parameters is not None and self._parameters.HasValue(context):
+            values = np.asarray(self._parameters.Eval(context))
+            if not is_finite(values):
+                return SamplerStatus.NOT_FINITE
+            build_many = partial(build_many, parameters=values)
         memory = context.get_abstract_state(int(self._memory)).get_value()
         length, angle = errors(x, goal)
         # An object that lies still is approached no nearer than its model says.
@@ -153,7 +167,7 @@ class ContactSampler(LeafSystem):
         nearer = nearer if c.sampling.follow else max(0.0, nearer)
         try:
             memory, found = sample_round(
-                c.sampling, memory, self._model.build_many, p, self._shape, x,
+                c.sampling, memory, build_many, p, self._shape, x,
                 x_desired.reshape(-1, N_X), length + c.angle_radius * angle,
                 phase[0] == CONTACT, context.get_time(), r, c.budget_sec,
                 nearer,

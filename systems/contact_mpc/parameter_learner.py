@@ -14,6 +14,7 @@ from makebreak.systems.contact_mpc.multibody.model_parameters import (
     POSITIVE,
     Parameter,
 )
+from makebreak.systems.contact_mpc.numerics.lcs import opening_speed
 from makebreak.systems.contact_mpc.numerics.parameter_posterior import (
     Belief,
     Loss,
@@ -257,7 +258,10 @@ class ParameterLearner(LeafSystem):
                 other[i] += DIFFERENCE
                 both = changes_by(lcs, build_of(other), sample, loss, lam)
                 dx[:, i], dw[:, i] = both[0] / DIFFERENCE, both[1] / DIFFERENCE
-            return dx * scale.slopes(values), dw * scale.slopes(values)
+            slips = opening_speed(lcs, sample.x_next, loss.slip_noise) > 0.0
+            one_sided = model.sticks(lcs, slips)
+            slopes = scale.slopes(values)
+            return dx * slopes, dw * slopes, one_sided
 
         try:
             W = self._weights(belief, sample, build)

@@ -19,7 +19,10 @@ from pydrake.systems.framework import Diagram
 
 from makebreak.systems.contact_mpc.multibody.constant_mass import constant_mass_model
 from makebreak.systems.contact_mpc.multibody.contact_layout import ContactLayout
-from makebreak.systems.contact_mpc.multibody.model_parameters import ModelParameters
+from makebreak.systems.contact_mpc.multibody.model_parameters import (
+    NOT_IN_PLANTS,
+    ModelParameters,
+)
 from makebreak.systems.contact_mpc.multibody.smooth_dynamics import SmoothDynamics
 from makebreak.systems.contact_mpc.multibody.witness_points import WitnessPoints
 from makebreak.systems.contact_mpc.numerics.constant_mass import (
@@ -53,8 +56,8 @@ class AnitescuLcs:
         x_default: (n_x,) the plant's default state.
         x_names, lam_names: of each state, and of each entry of lam, "geometry~geometry
             edge" (where the nearest are taken: "nearest k of geometry~... edge").
-        is_analytic: which of the two paths `build` takes; with parameters of bodies,
-            joints or rolling the general one.
+        is_analytic: which of the two paths `build` takes; with parameters that Drake's
+            plants do not have the general one.
         parameters: their names and nominal values (ModelParameters).
 
     Raises: ValueError naming a pair that does not exist, a body without collision
@@ -99,16 +102,20 @@ class AnitescuLcs:
             parameters, plant, self._plant_context, self._contacts.mu_of_pairs
         )
         self._values = self.parameters.nominal
+        self.is_analytic = False
+        self._inspector = inspector
         self._model = None
-        if analytic and not (
-            self.parameters.is_dynamic.any() or self.parameters.has("rolling")
-        ):
-            self._model = constant_mass_model(
-                plant, self._plant_context, inspector, self._dynamics, self._contacts,
-                self._points.frames,
-            )  # fmt: skip
+        if analytic and not self.parameters.has(*NOT_IN_PLANTS):
+            self._model = self._closed_form()
         self.is_analytic = self._model is not None
         self.at_default()  # Compile now, and fail now if anything is wrong.
+
+    def _closed_form(self) -> ConstantMassModel | None:
+        self._plant.SetPositionsAndVelocities(self._plant_context, self.x_default)
+        return constant_mass_model(
+            self._plant, self._plant_context, self._inspector, self._dynamics,
+            self._contacts, self._points.frames,
+        )  # fmt: skip
 
     def at_default(self) -> LCS:
         """The LCS about the plant's default state, without input."""
@@ -169,6 +176,8 @@ class AnitescuLcs:
             )
         if not np.array_equal(values[p.is_dynamic], self._values[p.is_dynamic]):
             self._dynamics.set_parameters(p, values)
+            if self.is_analytic:
+                self._model = self._closed_form()
         self._values = values
         if friction is None:
             friction = self._contacts.mu_of_pairs
@@ -180,6 +189,18 @@ class AnitescuLcs:
         """An LCS of this model whose gaps are not yet those of the parameters (n,)."""
         gap = self.parameters.of_pairs("gap", parameters, np.zeros(self.n_pairs))
         return self._contacts.with_gap(lcs, gap) if gap.any() else lcs
+
+    def sticks(self, lcs: LCS, slips) -> np.ndarray:
+        """(n,) whether a parameter is the friction of pairs of which none slips.
+
+        Args: slips (n_lam,) bool, of the LCS's rows.
+        """
+        pair = self._contacts.of_contacts(np.arange(self.n_pairs))
+        slipping = set(pair[np.asarray(lcs.contact, dtype=int)[slips]])
+        return np.array([
+            p.kind == "friction" and not slipping & set(p.pairs)
+            for p in self.parameters.items
+        ])  # fmt: skip
 
     def between(self, x, x_next) -> tuple[np.ndarray, np.ndarray]:
         """The constant velocity (n_v,) that leads from x to x_next, both (n_x,), in one
@@ -247,8 +268,9 @@ class AnitescuLcs:
             rows.normal, F_0, self.dt_sec, chosen, J_push,
         )  # fmt: skip
 
-    def build_many(self, x, u) -> tuple[np.ndarray, ...]:
-        """The LCS about each of many states x (n, n_x) and one input u (n_u,).
+    def build_many(self, x, u, parameters=None) -> tuple[np.ndarray, ...]:
+        """The LCS about each of many states x (n, n_x) and one input u (n_u,), with
+        the values (n,) of all parameters, or the nominal ones.
 
         Returns: A, B, D, d, E, F, H, c and phi (LCS), each with the n states first;
             not a number in those of a state that has no LCS.
@@ -264,22 +286,26 @@ class AnitescuLcs:
         shapes = ((n_x, n_x), (n_x, n_u), (n_x, n_lam), (n_x,), (n_lam, n_x),
                   (n_lam, n_lam), (n_lam, n_u), (n_lam,), (n_lam,))  # fmt: skip
         out = tuple(np.full((n, *shape), np.nan) for shape in shapes)
-        if self._model is None or self._contacts.groups_in_arrays is None:
-            self._fill_one_by_one(x, u, out)
+        if (
+            self._model is None
+            or self._contacts.groups_in_arrays is None
+            or self.parameters.has("gap")
+        ):
+            self._fill_one_by_one(x, u, parameters, out)
         else:
-            self._fill_compiled(x, u, out)
+            self._fill_compiled(x, u, parameters, out)
         return out
 
-    def _fill_one_by_one(self, x, u, out) -> None:
+    def _fill_one_by_one(self, x, u, parameters, out) -> None:
         for i in range(len(x)):
             try:
-                lcs = self.build(x[i], u)
+                lcs = self.build(x[i], u, parameters=parameters)
             except (ValueError, RuntimeError):
                 continue
             for array, name in zip(out, _LCS_FIELDS, strict=True):
                 array[i] = getattr(lcs, name)
 
-    def _fill_compiled(self, x, u, out) -> None:
+    def _fill_compiled(self, x, u, parameters, out) -> None:
         """The same in one compiled loop; normalises the quaternions in x."""
         good = np.isfinite(x).all(axis=1) & np.isfinite(u).all()
         for start, _ in self._dynamics.floating:
@@ -289,10 +315,15 @@ class AnitescuLcs:
         if not good.any():
             return
         contacts, rows = self._contacts, self._contacts.rows
+        weight, F_0 = contacts.weight, contacts.F_0
+        if len(self.parameters):
+            mu = contacts.friction_of(self._use(parameters, None, None)[0])
+            # The contacts of a group have the same friction.
+            weight, F_0 = contacts.rows_of(contacts.first, mu)
         part = tuple(array[good] for array in out)
         finite = build_many_constant_mass(
             x[good], u, self.dt_sec, tuple(vars(self._model).values()),
-            (rows.contact, rows.normal, contacts.weight, rows.edge, contacts.F_0),
+            (rows.contact, rows.normal, weight, rows.edge, F_0),
             contacts.groups_in_arrays, part,
         )  # fmt: skip
         for array, of_good in zip(out, part, strict=True):

@@ -30,7 +30,7 @@ def constant_mass_model(
     """
     if plant.num_force_elements() != 1:  # Gravity is always there, and constant.
         return None
-    bodies = _floating_bodies(plant)
+    bodies = _floating_bodies(plant, context)
     if bodies is None:
         return None
     joint_of, turning, inertias = bodies
@@ -75,7 +75,7 @@ def constant_mass_model(
     )  # fmt: skip
 
 
-def _floating_bodies(plant: MultibodyPlant):
+def _floating_bodies(plant: MultibodyPlant, context: Context):
     """{body index: its floating joint}; (q, v) and (5, 3) inertia of the bodies
     whose angular acceleration depends on the state (not isotropic about their
     origin). None where a joint rules out the fast path."""
@@ -88,9 +88,9 @@ def _floating_bodies(plant: MultibodyPlant):
             if frames != (plant.world_frame(), child.body_frame()):
                 return None
             joint_of[child.index()] = joint
-            inertia = child.default_spatial_inertia()
+            inertia = child.CalcSpatialInertiaInBodyFrame(context)
             if not _is_isotropic(inertia):
-                if joint.default_damping_vector().any():
+                if joint.GetDampingVector(context).any():
                     return None  # In the body's frame such damping is not constant.
                 turning.append((joint.position_start(), joint.velocity_start()))
                 centre, mass = inertia.get_com(), inertia.get_mass()

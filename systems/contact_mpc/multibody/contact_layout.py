@@ -26,7 +26,7 @@ class ContactLayout:
 
     Attributes, one entry for each combination of geometries (n,):
         geometries, names, mu, reference, planar: as of Contact.
-        every: (n,) 0, 1, ..., n - 1.
+        every: (n,) 0, 1, ..., n - 1; first: those whose place in the LCS is known.
     Others:
         n_pairs, n_lam: sizes; mu_of_pairs (n_pairs,), as configured. chooses: whether
             the LCS has only the nearest contacts.
@@ -69,7 +69,7 @@ class ContactLayout:
                 np.array([count for _, count in groups]),
             )
         # The contacts of a group have the same rows, so its first ones stand for any.
-        first = np.concatenate([of_group[:count] for of_group, count in groups])
+        self.first = first = np.concatenate([of[:count] for of, count in groups])
         self.rows = contact_rows([contacts[i].kind for i in first])
         self.n_lam = len(self.rows.contact)
         self.weight, self.F_0 = self._rows_for(self.mu[first], self._compliance[first])

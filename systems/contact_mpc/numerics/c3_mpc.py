@@ -19,7 +19,7 @@ docs/c3.md lists every choice in which implementations differ.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from numbers import Integral
 from typing import Any
 
@@ -32,6 +32,13 @@ from makebreak.systems.contact_mpc.numerics.c3_admm import (
     admm_plus,
     compiled_once,
     scaled_model,
+)
+from makebreak.systems.contact_mpc.numerics.c3_linear import (
+    LinearBound,
+    rows_of,
+    widened,
+    with_sums,
+    without_sums,
 )
 from makebreak.systems.contact_mpc.numerics.c3_plan import Plan, WarmStart
 from makebreak.systems.contact_mpc.numerics.c3_polish import polish
@@ -89,6 +96,8 @@ class C3Weights:
     Q_N: np.ndarray | None = None  # (n_x,) last state; None: Q.
     # Beside Q, which must be zero at these quaternions.
     orientation: list[OrientationWeight] = field(default_factory=list)
+    # (N, n_x) diagonals of the states but the last one, in place of Q.
+    Q_knots: np.ndarray | None = None
 
 
 @dataclass
@@ -122,6 +131,8 @@ class C3Bounds:
     u_upper: np.ndarray | None = None  # (n_u,) [N]
     x_lower: np.ndarray | None = None  # (n_x,) [SI]
     x_upper: np.ndarray | None = None  # (n_x,) [SI]
+    # On sums of states, inputs and contact forces of a step.
+    linear: list[LinearBound] = field(default_factory=list)
 
 
 class C3Problem:
@@ -144,7 +155,7 @@ class C3Problem:
         self.Q, self.R = _square("Q", weights.Q), _square("R", weights.R)
         self.Q_N = self.Q if weights.Q_N is None else _square("Q_N", weights.Q_N)
         self.n_x, self.n_u = len(self.Q), len(self.R)
-        self._Q = self.Q[None]
+        self._Q = self._of_knots(weights)
         self.orientation = [self._checked(o, weights) for o in weights.orientation]
         if self.Q_N.shape != self.Q.shape:
             raise ValueError(
@@ -166,6 +177,50 @@ class C3Problem:
                 f"C3Bounds: {self.lower[i]} to {self.upper[i]} for entry "
                 f"{i - self.n_lam} of [u, x], expected lower <= upper"
             )
+        self.sums = rows_of(bounds.linear, self.n_x, self.n_u, self.n_lam)
+        self.with_sums: C3Problem | None = None
+        if bounds.linear:
+            self.with_sums = self._with_sums(weights, bounds)
+
+    def _of_knots(self, weights):
+        """(1 or N, n_x, n_x) Q of the knots but the last one."""
+        if weights.Q_knots is None:
+            return self.Q[None]
+        Q, expected = np.asarray(weights.Q_knots, float), (self.options.N, self.n_x)
+        if Q.shape != expected or not ((Q >= 0.0) & (Q < np.inf)).all():
+            raise ValueError(
+                f"C3Weights.Q_knots is {Q.shape} of {Q.min():g} to {Q.max():g}, "
+                f"expected {expected}, finite, >= 0"
+            )
+        return _read_only(np.array([np.diag(row) for row in Q]))
+
+    def _with_sums(self, weights, bounds) -> "C3Problem":
+        """The problem whose last states are the sums of the linear bounds."""
+        (n_x, m), (lower, upper) = (self.n_x, len(bounds.linear)), self.sums[3:]
+
+        def wider(Q):
+            Q = widened(widened(Q, n_x, m).T, n_x, m)
+            return Q.T
+
+        x_lower, x_upper = (
+            np.append(np.full(n_x, none) if own is None else own, more)
+            for none, own, more in (
+                (-np.inf, bounds.x_lower, lower), (np.inf, bounds.x_upper, upper),
+            )
+        )  # fmt: skip
+        return C3Problem(
+            replace(
+                weights,
+                Q=wider(self.Q),
+                Q_N=wider(self.Q_N),
+                Q_knots=widened(weights.Q_knots, n_x, m),
+                G=widened(self.G, n_x, m),
+                U=widened(self.U, n_x, m, 1.0),
+            ),
+            self.projection,
+            self.options,
+            replace(bounds, x_lower=x_lower, x_upper=x_upper, linear=[]),
+        )
 
     def _checked(self, o, weights):
         name = f"C3Weights.orientation: OrientationWeight({o.start}, {o.weight})"
@@ -184,7 +239,7 @@ class C3Problem:
                 f"{name}: free_axis is {o.free_axis}, expected 3 numbers, not all 0"
             )
         of = slice(o.start, o.start + 4)
-        for matrix in (self.Q, self.Q_N):
+        for matrix in (self.Q, self.Q_N, *self._Q):
             if matrix[of].any():
                 raise ValueError(
                     f"{name}: Q weighs the quaternion's numbers too, expected zeros "
@@ -240,7 +295,8 @@ class C3Problem:
         if not self.orientation:
             return self._Q, self.Q_N, x_desired
         N = self.options.N
-        Q, goal = np.tile(self.Q, (N, 1, 1)), x_desired.copy()
+        Q, goal = np.array([self._Q[k % len(self._Q)] for k in range(N)]), x_desired
+        goal = goal.copy()
         Q_N = self.Q_N.copy()
         for o in self.orientation:
             of = slice(o.start, o.start + 4)
@@ -395,6 +451,19 @@ def solve_c3(
             f"solve_c3: warm.u is {warm.u.shape} and warm.delta {warm.delta.shape}, "
             f"expected {(o.N, p.n_u)} and {(o.N, p.n_z)}"
         )
+    if p.with_sums is not None:
+        n_sums = len(p.sums[0])
+        wider = [with_sums(each, *p.sums[:3]) for each in given_models]
+        warm_z = (widened(a, p.n_x, n_sums) for a in (warm.delta, warm.w))
+        plan, warm = solve_c3(
+            wider if len(wider) > 1 else wider[0],
+            widened(x0, p.n_x, n_sums),
+            widened(x_desired, p.n_x, n_sums),
+            p.with_sums,
+            WarmStart(warm.u, *warm_z),
+            modes,
+        )
+        return without_sums(plan, warm, p.n_x, n_sums)
     scale = 1.0
     if o.scale_lam:
         A_norm, D_norm = (
@@ -530,7 +599,7 @@ def plan_cost(lcs: LCS | Sequence[LCS], x0, u, x_desired, problem: C3Problem) ->
     for k in range(len(u) + 1):
         last = k == len(u)
         e = x - x_desired[k]
-        cost += e @ (p.Q_N if last else p.Q) @ e
+        cost += e @ (p.Q_N if last else p._Q[k % len(p._Q)]) @ e
         for o in p.orientation:
             of = slice(o.start, o.start + 4)
             weight = o.weight_N if last and o.weight_N is not None else o.weight

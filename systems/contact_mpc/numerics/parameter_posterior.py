@@ -32,6 +32,7 @@ from makebreak.systems.contact_mpc.numerics.residual_learner import (
 
 NEWTON_STEPS = 4  # Of one update, at most.
 HALVINGS = 4  # Of a Gauss-Newton step that does not lower the cost.
+BEYOND_NOISE = 2.0  # Deviations.
 SMALL = 1e-2  # A change of z that ends the update.
 
 
@@ -222,11 +223,16 @@ def changes_by(lcs: LCS, other: LCS, sample: Sample, loss: Loss, lam):
     return z_other - z + dD @ lam, q_other - q + dF @ lam
 
 
-def gradient_and_information(found: Explained, sample: Sample, loss: Loss, dx, dw):
+def gradient_and_information(
+    found: Explained, sample: Sample, loss: Loss, dx, dw, one_sided=False
+):
     """The loss's gradient (n,) and Gauss-Newton Hessian (n, n).
 
     Args: dx (n_x, n), dw (n_lam, n): derivatives of x_next and of the gap velocities
-        at the forces found.
+        at the forces found. one_sided (n,) bool: parameters which the step can tell to
+        be larger, and never smaller: the friction of a contact that sticks. Noise that
+        goes one way would count, and what goes the other way not, so such a step counts
+        for nothing unless it is BEYOND_NOISE.
     """
     lcs = found.lcs
     error = loss.W @ (step_of(lcs, sample, loss)[0] + lcs.D @ found.lam)
@@ -238,6 +244,8 @@ def gradient_and_information(found: Explained, sample: Sample, loss: Loss, dx, d
     if free.any():
         basis, _ = np.linalg.qr(of_lam)
         of_z = of_z - basis @ (basis.T @ of_z)
+    noise = one_sided & (gradient**2 < BEYOND_NOISE**2 * (of_z**2).sum(axis=0))
+    gradient, of_z = np.where(noise, 0.0, gradient), np.where(noise, 0.0, of_z)
     return gradient, of_z.T @ of_z
 
 
@@ -247,7 +255,7 @@ def updated(
     loss: Loss,
     trust: float,
     build: Callable[[np.ndarray], LCS],
-    changes: Callable[[np.ndarray, LCS, np.ndarray], tuple[np.ndarray, np.ndarray]],
+    changes: Callable[[np.ndarray, LCS, np.ndarray], tuple[np.ndarray, ...]],
     starts=(),
 ) -> tuple[Belief, Explained | None]:
     """The belief after a step, and the step as the new mean explains it.
@@ -255,7 +263,8 @@ def updated(
     Args:
         trust: factor on the loss.
         build: the LCS about the sample's x and u for z (n,).
-        changes: for z, its LCS and the forces: dx and dw by z.
+        changes: for z, its LCS and the forces: the further arguments of
+            gradient_and_information.
         starts: further z from which the minimum is looked for, as the loss is flat
             where a contact is missed; the best one is taken.
     Returns: the belief as it was, and None, where no QP was solved.
@@ -277,8 +286,8 @@ def updated(
     z, found, cost = min(begun, key=lambda each: each[2])
     more = np.zeros_like(belief.information)
     for _ in range(NEWTON_STEPS):
-        dx, dw = changes(z, found.lcs, found.lam)
-        gradient, information = gradient_and_information(found, sample, loss, dx, dw)
+        of_z = changes(z, found.lcs, found.lam)
+        gradient, information = gradient_and_information(found, sample, loss, *of_z)
         more = trust * information
         slope = belief.information @ (z - belief.mean) + trust * gradient
         step = -np.linalg.solve(belief.information + more, slope)

@@ -1,0 +1,77 @@
+"""The wiring of a ParameterLearner beside planners that know gaps as a residual."""
+
+import re
+
+import numpy as np
+from pydrake.systems.framework import (
+    Context,
+    Diagram,
+    DiagramBuilder,
+    LeafSystem,
+    OutputPort,
+)
+from pydrake.systems.primitives import MatrixGain
+
+from makebreak.diagrams import wiring
+from makebreak.systems.contact_mpc.parameter_learner import ParameterLearner
+
+
+def add_parameter_learner(
+    builder: DiagramBuilder,
+    learner: ParameterLearner,
+    state: LeafSystem,
+    ready: str,
+    users: list[LeafSystem],
+    rows: int,
+    dt_sec: float,
+) -> OutputPort:
+    """Adds `parameter_learner`, and gives what it learns but the gap to the users.
+
+    Args: state: has x, u_measured and the port `ready`; users: their port `parameters`
+        has all but the gap, in order; rows: the first ones of the LCS, whose gap is
+        learned; dt_sec: time step over which a residual is a velocity [s].
+    Returns: the gap as r_comp (n_lam,) [m/s], of the system `learned_residual`.
+    """
+    builder.AddNamedSystem("parameter_learner", learner)
+    for name, port in (
+        ("x", "x"), ("u_measured", "u_measured"), (ready, "enable"),
+    ):  # fmt: skip
+        wiring.connect(builder, state, name, learner, port)
+    items = learner.model.parameters.items
+    is_gap = np.array([p.kind == "gap" for p in items])
+    if not is_gap.all():
+        values = _gain(builder, "learned_values", learner, np.eye(len(items))[~is_gap])
+        for user in users:
+            builder.Connect(values, user.GetInputPort("parameters"))
+    residual = np.zeros((learner.model.n_lam, len(items)))
+    residual[:rows, is_gap] = 1.0 / dt_sec
+    return _gain(builder, "learned_residual", learner, residual)
+
+
+def add_gap_std(
+    builder: DiagramBuilder, learner: ParameterLearner, dt_sec: float
+) -> OutputPort:
+    """(1,) standard deviation of the learned gap as a velocity [m/s]."""
+    items = learner.model.parameters.items
+    scale = [[p.std / dt_sec if p.kind == "gap" else 0.0 for p in items]]
+    return _gain(builder, "learned_std", learner, np.array(scale), "std")
+
+
+def what_was_learned(diagram: Diagram, context: Context) -> dict[str, float]:
+    """Each parameter's learned value and the ends of its 90 % interval, as keys of a
+    result; empty without a `parameter_learner`."""
+    found: dict[str, float] = {}
+    if not diagram.HasSubsystemNamed("parameter_learner"):
+        return found
+    learner = diagram.GetSubsystemByName("parameter_learner")
+    assert isinstance(learner, ParameterLearner)
+    for row in learner.learned(learner.GetMyContextFromRoot(context)):
+        key = "_".join(re.findall(r"\w+", f"learned_{row.name}"))
+        found |= {key: row.learned, f"{key}_low": row.low, f"{key}_high": row.high}
+    return found
+
+
+def _gain(builder, name, learner, matrix, port="parameters") -> OutputPort:
+    gain = builder.AddNamedSystem(name, MatrixGain(matrix))
+    builder.Connect(learner.GetOutputPort(port), gain.get_input_port())
+    return gain.get_output_port()
