@@ -1,8 +1,11 @@
 """A controller that plans through contact for any plant: LCS builder and C3."""
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
@@ -14,6 +17,15 @@ from makebreak.systems.contact_mpc.lcs_builder import (
 )
 from makebreak.systems.contact_mpc.multibody.model_parameters import Parameter
 from makebreak.systems.contact_mpc.numerics.c3_mpc import C3Bounds, C3Options, C3Weights
+
+
+@dataclass
+class KnotWeights:
+    """Weights of the state in place of Q [1/SI^2]: at the plan's end, (n_x,) or a
+    matrix, row by row, and at the knots before it, (N, n_x); None: Q."""
+
+    Q_N: list[Any] | None = None
+    Q_knots: list[list[float]] | None = None
 
 
 @dataclass
@@ -38,10 +50,61 @@ class ContactMpcConfig:
     lcs_along_plan: bool = False
     # Those that a ParameterLearner learns; the plan is for its values of them.
     parameters: list[Parameter] = field(default_factory=list)
-    # (n_x,) weights of the state at the plan's end, None: Q; (N, n_x) at the knots
-    # before it, in place of Q.
-    Q_N: list[float] | None = None
-    Q_knots: list[list[float]] | None = None
+    weights: KnotWeights = field(default_factory=KnotWeights)
+
+
+def tuned(
+    config: ContactMpcConfig,
+    plant: MultibodyPlant,
+    moved: Sequence[tuple[int, int]],
+    length: float,
+    speed: float,
+    force: float,
+    coast_sec: float,
+) -> ContactMpcConfig:
+    """The config with weights and time step for pushing something over a length.
+
+    C3's other weights are for forces of some newtons, so those of the state grow with
+    the force. What is pushed cannot be pulled back: the plan's end is weighed by where
+    it comes to rest, and the way there hardly.
+
+    Args:
+        plant: the model's.
+        moved: index in q and in v of each coordinate that is to get somewhere.
+        length: how far [m] or [rad]; speed: how fast, about [m/s] or [rad/s].
+        force: what it takes [N]: 4 mass speed^2 / length of all that moves, and
+            friction and damping (for a turn, over the lever arm).
+        coast_sec: distance over speed in which it comes to rest alone: mass over
+            damping, or speed / (2 friction g).
+    Raises: ValueError for a number that is not positive, or a plant without actuators.
+    """
+    for name, value in (("length", length), ("speed", speed), ("force", force)):
+        if not 0.0 < value < np.inf:
+            raise ValueError(f"tuned: {name} is {value}, expected a positive number")
+    if not 0.0 <= coast_sec < np.inf:
+        raise ValueError(f"tuned: coast_sec is {coast_sec}, expected >= 0")
+    n_q, n_v = plant.num_positions(), plant.num_velocities()
+    driven = plant.MakeActuationMatrix().any(axis=1)
+    Q = np.zeros((n_q + n_v, n_q + n_v))
+    for j in n_q + np.flatnonzero(driven):
+        Q[j, j] = 0.06 * (force / speed) ** 2
+    for i, j in moved:
+        Q[i, i], Q[n_q + j, n_q + j] = (
+            12.0 * (force / length) ** 2, 1.2 * (force / speed) ** 2,
+        )  # fmt: skip
+    Q_N = Q.copy()
+    for i, j in moved:
+        ends = np.array([1.0, coast_sec])
+        at = np.ix_([i, n_q + j], [i, n_q + j])
+        Q_N[at] += Q[i, i] * (np.outer(ends, ends) - np.diag([1.0, 0.0]))
+    return replace(
+        config,
+        Q=(0.03 * np.diag(Q)).tolist(),
+        weights=KnotWeights(Q_N.tolist()),
+        R=[0.01] * int(driven.sum()),
+        dt_sec=length / (20.0 * speed),
+        period_sec=length / (20.0 * speed),
+    )
 
 
 def make_contact_mpc(model: Diagram, config: ContactMpcConfig) -> Diagram:
@@ -100,8 +163,8 @@ def make_contact_mpc(model: Diagram, config: ContactMpcConfig) -> Diagram:
     U = np.repeat([1.0, 1.0, 1.0, 10.0], [n_x, n_lam, n_u, n_lam])
     weights = C3Weights(
         np.array(c.Q), np.array(c.R), G, U,
-        Q_N=None if c.Q_N is None else np.array(c.Q_N),
-        Q_knots=None if c.Q_knots is None else np.array(c.Q_knots),
+        Q_N=None if c.weights.Q_N is None else np.array(c.weights.Q_N),
+        Q_knots=None if c.weights.Q_knots is None else np.array(c.weights.Q_knots),
     )  # fmt: skip
     c3 = builder.AddNamedSystem(
         "c3",

@@ -145,8 +145,6 @@ class PushParametersConfig:
     turn_radius: float = 0.05
     # Deviation of the gap speed of a closed contact [m/s].
     contact_std: float = 0.02
-    # Noise of the measured sliding speed, times the friction [m/s].
-    slip_noise: float = 0.02
 
 
 @dataclass
@@ -333,13 +331,12 @@ def learned_parameters(config: PushObjectConfig) -> list[Parameter]:
 def parameter_learner_config(
     own: PushParametersConfig, pairs: list[ContactPair], items: list[Parameter]
 ) -> ParameterLearnerConfig:
+    """Config of the learner of these parameters of contact_pairs."""
     Q_d = np.zeros(N_X)
     for part in (V_TIP, V_BALL):
         Q_d[part.start : part.start + 2] = own.weight
     Q_d[W_BALL.start + 2] = own.weight * own.turn_radius**2
-    return ParameterLearnerConfig(
-        pairs, items, Q_d.tolist(), own.contact_std, slip_noise=own.slip_noise
-    )
+    return ParameterLearnerConfig(pairs, items, Q_d.tolist(), own.contact_std)
 
 
 def past_config(pose: PoseSensorConfig, height: float) -> PastStateConfig:

@@ -11,7 +11,9 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from makebreak.diagrams.contact_mpc import (
         ContactMpcConfig as ContactMpcConfig,
+        KnotWeights as KnotWeights,
         make_contact_mpc as make_contact_mpc,
+        tuned as tuned,
     )
     from makebreak.models.pushed_object import (
         PushedObject as PushedObject,

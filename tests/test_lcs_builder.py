@@ -35,7 +35,13 @@ from pydrake.systems.primitives import ConstantVectorSource
 from scipy.optimize import nnls
 
 from makebreak import model_path
-from makebreak.diagrams.contact_mpc import ContactMpcConfig, make_contact_mpc
+from makebreak.benchmarks import plants
+from makebreak.diagrams.contact_mpc import (
+    ContactMpcConfig,
+    KnotWeights,
+    make_contact_mpc,
+    tuned,
+)
 from makebreak.systems.contact_mpc.lcs_builder import (
     Anitescu,
     AnitescuLcs,
@@ -1482,6 +1488,73 @@ def test_a_goal_that_moves_is_the_goal_of_each_knot():
     later[1:, 1] += 0.1 * np.arange(10)
     assert planned(later) > expected + 0.1
     # The same as a goal that stands still, if the knots where it moves have no weight.
-    only_end = {"Q_knots": np.zeros((10, 4)).tolist(), "Q_N": [0, 200, 1, 20]}
+    weights = KnotWeights([0, 200, 1, 20], np.zeros((10, 4)).tolist())
     later[-1] = still[-1]
-    assert planned(later, **only_end) == pytest.approx(planned(still, **only_end))
+    assert planned(later, weights=weights) == pytest.approx(
+        planned(still, weights=weights)
+    )
+
+
+SLIDER = plants.sdf(
+    plants.finger("tip", plants.X, "0.1 0 0", 0.03, 0.5, damping=3.0),
+    plants.link("s", 5.0, plants.shape("c", plants.box(0.1, 0.2, 0.1)), arm=0.05),
+    plants.joint("s", "1 0 0", driven=False, damping=20.0),
+)
+LIFT = plants.sdf(
+    plants.finger("tip", plants.XZ, "0 0 -0.04", 0.01, 0.3, damping=1.0),
+    plants.link("s", 2.0, plants.shape("c", plants.box(0.1, 0.1, 0.05)), arm=0.03),
+    plants.joint("s", "0 0 1", driven=False, damping=2.0),
+)
+FLAP = plants.sdf(
+    plants.finger("tip", plants.XY, "0.15 0.05 0", 0.01, 0.2, damping=1.0),
+    plants.link(
+        "s", 0.3, plants.shape("c", plants.box(0.2, 0.02, 0.05), "0.1 0 0"), arm=0.12
+    ),
+    plants.joint("s", "0 0 1", kind="revolute", driven=False, damping=0.1),
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "normal", "at", "goal", "speed", "force", "coast_sec"),
+    [
+        (SLIDER, [0.0, 0.0, 1.0], 1, -0.4, 0.4, 18.0, 5.0 / 20.0),
+        (LIFT, [0.0, 1.0, 0.0], 2, 0.2, 0.2, 24.4, 0.2 / (2 * 9.81)),
+        (FLAP, [0.0, 0.0, 1.0], 2, -0.5, 1.0, 1.2, 0.3 * 0.12**2 / 0.1),
+    ],
+    ids=["slider", "lift", "flap"],
+)
+def test_the_rule_for_weights_and_time_step_pushes_what_it_was_not_tuned_on(
+    text, normal, at, goal, speed, force, coast_sec
+):
+    """Within 5 % of the length in four times the time that it says."""
+    builder = DiagramBuilder()
+    plant, _ = AddMultibodyPlantSceneGraph(builder, 0.001)
+    Parser(plant).AddModelsFromString(text, "sdf")
+    plant.Finalize()
+    n, length = plant.num_positions(), abs(goal)
+    x_desired = np.zeros(2 * n)
+    x_desired[at] = goal
+    c = ContactMpcConfig(
+        [ContactPair("tip", "s", 0.3, 1, plane_normal=normal)],
+        x_desired=x_desired.tolist(),
+    )
+    c = tuned(c, plant, [(at, at)], length, speed, force, coast_sec)
+    mpc = builder.AddSystem(make_contact_mpc(diagram_of(text), c))
+    builder.Connect(plant.get_state_output_port(), mpc.GetInputPort("x"))
+    builder.Connect(mpc.GetOutputPort("u"), plant.get_actuation_input_port())
+    simulator = Simulator(builder.Build())
+    simulator.AdvanceTo(4.0 * length / speed)
+    q = plant.GetPositions(plant.GetMyContextFromRoot(simulator.get_context()))
+    assert abs(q[at] - goal) < 0.05 * length
+
+
+def test_numbers_of_a_task_that_make_no_sense_are_refused():
+    _, plant = plants.diagram_of(SLIDER)
+    for numbers, said in (
+        ((0.0, 1.0, 1.0, 1.0), "length is 0.0, expected a positive number"),
+        ((1.0, -1.0, 1.0, 1.0), "speed is -1.0, expected a positive"),
+        ((1.0, 1.0, np.inf, 1.0), "force is inf, expected"),
+        ((1.0, 1.0, 1.0, -1.0), "coast_sec is -1.0, expected >= 0"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            tuned(ContactMpcConfig(), plant, [(1, 1)], *numbers)

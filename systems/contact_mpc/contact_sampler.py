@@ -47,7 +47,9 @@ class Model(Protocol):
     x_default: np.ndarray
 
     @property
-    def parameters(self) -> Sized: ...
+    def parameters(self) -> Sized:
+        """Those of which build_many takes values."""
+        ...
 
     def build_many(self, x, u, parameters=None) -> tuple[np.ndarray, ...]: ...
 

@@ -89,6 +89,7 @@ class ModelParameters:
         self._forces = MultibodyForces(plant)
 
     def has(self, *kinds: str) -> bool:
+        """Whether a parameter is of one of these kinds."""
         return any(p.kind in kinds for p in self.items)
 
     def __len__(self) -> int:
