@@ -130,25 +130,45 @@ def _needless(
         key = choice.effect.kind if choice.in_group else k
         units.setdefault(key, []).append(choice)
     for unit in reversed(units.values()) if len(units) > 1 else ():
-        outcome = judge(without(problem, selection, *[c.effect for c in unit]))
-        if outcome is None or not outcome.gap.window_s:
+        alone = _gap_without(problem, selection, unit, judge)
+        if alone is None:
             continue
-        alone = outcome.gap
         places = {
             place for place in [WHOLE, *_channels_of(gap)]
             if place == WHOLE
             or any(acts_on(problem, c.effect, place) for c in unit)
         }  # fmt: skip
         for place in sorted(places):
-            if _is_worse_than(alone, gap, place):
-                a, b = (_error_at(g, place) for g in (alone, gap))
-                at = "" if place == WHOLE else f" at {place}"
-                why = (
-                    f"Beside the other effects it takes the held-out error{at} from "
-                    f"{figure(a)} to {figure(b)} times the expected error."
-                )
-                return [(c, why) for c in unit]
+            if not _is_worse_than(alone, gap, place):
+                continue
+            # Of a group what acts there, if that is worse than without, too.
+            mine = [
+                c for c in unit if place == WHOLE or acts_on(problem, c.effect, place)
+            ]
+            less = alone
+            if len(mine) < len(unit):
+                found = _gap_without(problem, selection, mine, judge)
+                if found is None or not _is_worse_than(found, gap, place):
+                    continue
+                less = found
+            if _is_worse_than(gap, less, WHOLE):  # Others are worse without.
+                continue
+            a, b = (_error_at(g, place) for g in (less, gap))
+            at = "" if place == WHOLE else f" at {place}"
+            why = (
+                f"Beside the other effects it takes the held-out error{at} from "
+                f"{figure(a)} to {figure(b)} times the expected error."
+            )
+            return [(c, why) for c in mine]
     return []
+
+
+def _gap_without(
+    problem: GapProblem, selection: Selection, some: Sequence[Choice], judge: Judge
+) -> GapMeasure | None:
+    """What held-out windows show without some effects; None: nothing."""
+    outcome = judge(without(problem, selection, *[c.effect for c in some]))
+    return outcome.gap if outcome is not None and outcome.gap.window_s else None
 
 
 # ----- Where held-out data are worse

@@ -160,16 +160,31 @@ def decide(facts: Facts) -> tuple[str, str]:
     return next((verdict, says(facts)) for holds, verdict, says in rows if holds(facts))
 
 
-def too_weak(facts: Facts, closed: float) -> str:
-    """Why effects that leave a gap are no name for it, in words; "": they are. closed:
-    share of the gap that they close in the equations."""
+def too_weak(
+    facts: Facts, closed: float, acts_on: Callable[[Choice, str], bool]
+) -> list[tuple[Choice, str]]:
+    """Of effects that leave a gap those that are no name for it, and why, in words.
+
+    Args: closed: share of the gap that all close in the equations. acts_on: whether one
+        acts at a channel, whose own gap counts, too: what one joint lacks is no less
+        certain where much is left at others.
+    """
     if not facts.choices or decide(facts)[0] != "gap_unnamed":
-        return ""
-    if facts.chosen_on is not None:
-        closed = min(closed, facts.chosen_on.reduction)
-    if closed >= CLOSED_SHARE_MIN:
-        return ""
-    return f"It closes {max(closed, 0.0):.0%} of the gap, too little to be named."
+        return []
+    weak = []
+    for choice in facts.choices:
+        most = closed
+        if facts.chosen_on is not None:
+            own = [
+                1.0 - share_left(each["before"], each["after"])
+                for name, each in facts.chosen_on.per_channel.items()
+                if each["before"] > AGREEMENT_RMS_MAX and acts_on(choice, name)
+            ]
+            most = min(closed, max([facts.chosen_on.reduction, *own]))
+        if most < CLOSED_SHARE_MIN:
+            why = f"It closes {max(most, 0.0):.0%} of the gap, too little to be named."
+            weak.append((choice, why))
+    return weak
 
 
 def tried(choice: Choice, why: str, plant: MultibodyPlant) -> Tried:

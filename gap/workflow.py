@@ -24,7 +24,7 @@ from makebreak.gap.by_recording import (
     may_differ,
     with_differences,
 )
-from makebreak.gap.confirm import confirmed, judge_of
+from makebreak.gap.confirm import acts_on, confirmed, judge_of
 from makebreak.gap.data import sampled_commands
 from makebreak.gap.data.channel_noise import in_newton_metres
 from makebreak.gap.data.check_drives import (
@@ -531,9 +531,9 @@ def conclude(
     outcome: Outcome | None = None
     while True:
         facts = facts_of(selection, chosen_on)
-        if selection.choices and (why := _withdrawn(problem, selection, facts)):
-            vetoed += [(choice, why) for choice in selection.choices]
-            selection = without(problem, selection, *selection.effects())
+        if selection.choices and (weak := _withdrawn(problem, selection, facts)):
+            vetoed += weak
+            selection = without(problem, selection, *[c.effect for c, _ in weak])
         else:
             found = confirmed(problem, selection, judge)
             outcome, vetoed = found.outcome, [*vetoed, *found.vetoed]
@@ -630,17 +630,27 @@ def _beyond_laws(problem: GapProblem, selection: Selection) -> Selection:
     return selection
 
 
-def _withdrawn(problem: GapProblem, selection: Selection, facts: Facts) -> str:
-    """Why none of the effects is named, by the data that they were chosen on; "": they
-    are."""
+def _withdrawn(
+    problem: GapProblem, selection: Selection, facts: Facts
+) -> list[tuple[Choice, str]]:
+    """Effects that are not named, and why, by the data that they were chosen on."""
+    why = ""
     turned, is_better = problem.other_gravity(selection.end)
     if is_better:  # Forces and loads stand for a robot that hangs on a wall.
-        return "Another direction of gravity explains more."
-    if facts.chosen_on is None:
-        return _TOO_SHORT_TO_CHOOSE
-    if not facts.chosen_on.is_measured:
-        return f"It could not be judged by simulation. {facts.chosen_on.failure}"
-    return too_weak(facts, problem.closed(selection.start, selection.end))
+        why = "Another direction of gravity explains more."
+    elif facts.chosen_on is None:
+        why = _TOO_SHORT_TO_CHOOSE
+    elif not facts.chosen_on.is_measured:
+        why = f"It could not be judged by simulation. {facts.chosen_on.failure}"
+    if why:
+        return [(choice, why) for choice in selection.choices]
+    closed = 1.0  # Windows say it twice where there are no equations.
+    if problem.by_equations:
+        closed = problem.closed(selection.start, selection.end)
+    return too_weak(
+        facts, closed,
+        lambda c, channel: acts_on(problem, c.effect, channel.rsplit(".", 1)[0]),
+    )  # fmt: skip
 
 
 def _reported_on(

@@ -7,6 +7,7 @@ import pytest
 from effect_scenes import at_rest_but, double, pendulum, with_effects
 
 from makebreak.gap.numerics.driven_arm import mass_and_bias, rollout
+from makebreak.gap.simulation import driven_arm
 from makebreak.gap.simulation.commands import Commands
 from makebreak.gap.simulation.driven_arm import (
     DrivenArmScene,
@@ -96,7 +97,8 @@ def commands(joints, seconds=1.0, rate=50.0):
 
 
 @pytest.mark.parametrize("lacks", LACKS)
-def test_a_tree_of_joints_moves_as_in_drake(tmp_path, lacks):
+def test_a_tree_of_joints_moves_as_in_drake(tmp_path, lacks, monkeypatch):
+    monkeypatch.setattr(driven_arm, "HOLDS", 1.0)  # Friction fades as in Drake.
     scene, joints = tree(tmp_path)
     scene = with_effects(scene, *ROTORS, *LACKS[lacks])
     time, told = commands(joints)
@@ -183,3 +185,37 @@ def test_what_cannot_be_stepped_ends_in_nan(tmp_path):
     light = arm._replace(mass=-arm.mass)  # No motion has this.
     y = rollout(light, np.zeros(4), np.zeros(4), [0.0, 0.1], np.zeros((1, 2, 4)))
     assert np.isnan(y).all()
+
+
+HELD = """<mujoco><option timestep="0.0005" gravity="0 0 0"/><worldbody><body>
+<joint name="j" axis="0 1 0" frictionloss="1.5"/><inertial pos="0 0 0" mass="1"
+diaginertia="0.05 0.05 0.05"/></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("creep_sec", [0.0, 0.001])
+def test_friction_that_holds_creeps_as_far_as_it_is_said_to(tmp_path, creep_sec):
+    """With 1 ms as in MuJoCo with its solver as it comes; else not at all."""
+    mujoco = pytest.importorskip("mujoco")
+    model = mujoco.MjModel.from_xml_string(HELD)
+    data, push = mujoco.MjData(model), 0.9  # [N m], of 1.5 that hold.
+    data.qfrc_applied[0] = push
+    for _ in range(800):
+        mujoco.mj_step(model, data)
+    scene = pendulum(tmp_path)
+    (tmp_path / "p.urdf").write_text(
+        """<robot name="p"><link name="base"/><link name="l"><inertial><mass value="1"/>
+<inertia ixx="0.05" iyy="0.05" izz="0.05" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="j" type="continuous"><parent link="base"/><child link="l"/>
+<axis xyz="0 1 0"/></joint></robot>"""
+    )
+    actuation = ActuationSection(type="effort", joints=["p.j"])
+    scene = replace(scene, actuation=actuation)
+    scene = with_effects(scene, ("joint_coulomb_friction", "p.j", dict(coulomb=1.5)))
+    simulation = DrivenArmSimulation(scene)
+    simulation.set_creep(creep_sec)
+    time = np.linspace(0.0, 0.4, 41)
+    told = Commands(time, {"p.j.effort_command": np.full(41, push)})
+    q = simulation.run(at_rest_but({"p.j": 0.0}), time, ["p.j.position"], told)[-1, 0]
+    assert data.qpos[0] > 0.005  # It does creep there.
+    assert q < 2e-4 or creep_sec
+    assert creep_sec == 0.0 or q == pytest.approx(data.qpos[0], rel=0.2)

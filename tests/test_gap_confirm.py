@@ -179,6 +179,8 @@ def test_a_simulation_that_stopped_is_no_evidence():
         (0.3, 0.9, "It closes 30% of the gap, too little to be named."),
         (0.9, 0.3, "It closes 30% of the gap, too little to be named."),
         (0.9, 0.9, ""),
+        # Three quarters of what is left at the effect's own joint.
+        (0.3, 0.9, "own"),
     ],
 )
 def test_half_of_the_gap_must_be_closed_in_simulation_and_in_equations(
@@ -187,9 +189,13 @@ def test_half_of_the_gap_must_be_closed_in_simulation_and_in_equations(
     effect = Effect(KIND, ["arm.j1"], {"coulomb": 4.0})
     choice = Choice(effect, {}, 9.0, 1.0, "", 1.0, (), (), 1)
     shown = GapMeasure(11.0, 11.0 - 10.0 * in_simulation, 1.0, 0.3)
+    shown = replace(
+        shown, per_channel={"arm.j1.position": {"before": 9.0, "after": 3.0}}
+    )
     facts = Facts((choice,), 11.0, 8.0, far=True, chosen_on=shown)
     assert decide(facts)[0] == "gap_unnamed"
-    assert too_weak(facts, in_equations) == why
+    weak = too_weak(facts, in_equations, lambda c, channel: why == "own")
+    assert weak == ([(choice, why)] if why not in ("", "own") else [])
 
 
 @pytest.mark.parametrize(

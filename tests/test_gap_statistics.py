@@ -1238,10 +1238,10 @@ def test_an_agreement_that_simulation_does_not_show_at_the_end_is_taken_back(
 @pytest.mark.parametrize("after, closed", [(8.04, "12%"), (5.24, "47%")])
 def test_candidates_that_close_too_little_are_told_with_their_value(after, closed):
     facts = Facts([a_backlash()], 9.0, after, chosen_on=windows_leave(9.0, after))
-    why = too_weak(facts, 1.0 - (after - 1.0) / 8.0)
+    ((_, why),) = too_weak(facts, 1.0 - (after - 1.0) / 8.0, lambda *_: False)
     assert f"closes {closed} of the gap" in why
     near = Facts([a_backlash()], 9.0, 2.5, chosen_on=windows_leave(9.0, 2.5))
-    assert too_weak(near, 0.9) == ""
+    assert too_weak(near, 0.9, lambda *_: False) == []
     each = Tried("joint_backlash", ("a.j",), {"gap": Estimate(0.02, 1e-3, "rad")},
                  "", why)  # fmt: skip
     text = says_tried([each])

@@ -14,6 +14,7 @@ from makebreak.gap.residuals.driven import DrivenProblem, is_driven, sticks
 from makebreak.gap.residuals.mechanism import MechanismProblem
 from makebreak.gap.search.groups import groups_of
 from makebreak.gap.search.select import select
+from makebreak.gap.simulation import driven_arm
 from makebreak.gap.simulation.commands import Commands
 from makebreak.gap.simulation.driven_arm import DrivenArmSimulation
 from makebreak.gap.workflow import other_problem, problem_for, run_gap
@@ -178,6 +179,7 @@ def test_held_out_windows_of_equations_are_stepped_by_compiled_code(
 ):
     """A servo forgets within a window what its steps were off by: Drake's own leave as
     much."""
+    monkeypatch.setattr(driven_arm, "HOLDS", 1.0)  # Friction fades as in Drake.
     hidden = [("joint_viscous_damping", ["d.j1"], dict(damping=2.0))]
     scene, file = recorded(tmp_path, "two", hidden)
     truth = [Effect(*each) for each in hidden]
@@ -306,3 +308,38 @@ def test_of_a_velocity_drive_friction_is_looked_for_in_equations(tmp_path):
     assert not DrivenProblem(scene, recordings).is_explained()
     problem, _ = problem_for(scene, recordings, SceneDynamics(scene))
     assert isinstance(problem, MechanismProblem)
+
+
+def test_links_within_their_tolerance_explain_a_joint_that_a_weak_drive_lets_sag(
+    tmp_path,
+):
+    """By columns of links where they are: what a centre of mass does to a joint that
+    sags by half a radian is no multiple of what it does to one that does not."""
+    joints = ["d.j1", "d.j2"]
+    weak = replace(
+        double(tmp_path),
+        actuation=ActuationSection(
+            type="servo", joints=joints, kp=[60.0, 1.5], kd=[6.0, 0.3]
+        ),
+        tolerance={"link_com_m": 0.03, "link_mass": 0.02},
+    )
+    at = SceneDynamics(weak).now("object_com", ["d.lower"])
+    moved = ("object_com", "d.lower", at | {"x": at["x"] + 0.05, "z": at["z"] - 0.02})
+    truth = with_effects(weak, moved)
+    time, told = goals(2, np.random.default_rng(3))
+    names = [f"{joint}.position" for joint in joints]
+    columns = {f"{j}.position_command": u for j, u in zip(joints, told, strict=True)}
+    rows = DrivenArmSimulation(truth).run(
+        at_rest_but(dict(zip(joints, told[:, 0], strict=True))),
+        time, names, Commands(time, columns),
+    )  # fmt: skip
+    rows += 2e-4 * np.random.default_rng(4).normal(size=rows.shape)
+    header = ["time", *names, *(f"{joint}.position_command" for joint in joints)]
+    file = tmp_path / "recording.csv"
+    np.savetxt(
+        file, np.column_stack([time, rows, *told]), delimiter=",", comments="",
+        header=",".join(header), fmt="%.9g",
+    )  # fmt: skip
+    problem = DrivenProblem(weak, read_recordings([file]))
+    assert problem.noise_error(problem.base()) > 20.0
+    assert problem.is_explained()

@@ -28,9 +28,14 @@ def gain_changes(
 ) -> Iterator[tuple[str, Effect, float]]:
     """(name, effect, size) of each joint's stiffness and damping, more by the share
     `size` that they are known to; none where the scene has no such tolerance."""
-    share = float(scene.tolerance.get(KEY, KNOWN_TO))
+    share = gains_known_to(scene)
     for joint in joints if share else ():
         yield from _changes(scene, joint, share)
+
+
+def gains_known_to(scene: Scene) -> float:
+    """The share of a gain to which simulated windows take it to be known."""
+    return float(scene.tolerance.get(KEY, KNOWN_TO))
 
 
 def with_moved_gains(scene: Scene, names: Sequence[str], values) -> Scene:
@@ -46,7 +51,7 @@ def with_moved_gains(scene: Scene, names: Sequence[str], values) -> Scene:
         if law is None:
             return scene
         more_kp, more_kd = (
-            float(found.get(_name(joint, gain), 0.0)) for gain in ("kp", "kd")
+            float(found.get(gain_name(joint, gain), 0.0)) for gain in ("kp", "kd")
         )
         kp.append(float(law.kp) * (1.0 + more_kp))
         more = more_kd * float(law.kd + law.emf)
@@ -78,7 +83,8 @@ def gain_columns(model) -> tuple[list[np.ndarray], list[float], list[str]]:
     return columns, prior, names
 
 
-def _name(joint: str, gain: str) -> str:
+def gain_name(joint: str, gain: str = "kp") -> str:
+    """Of the nuisance."""
     return f"{KEY} of {joint}, {gain}"
 
 
@@ -90,6 +96,7 @@ def _changes(
     if law is None:
         return
     if law.kp > 0.0:
-        yield _name(joint, "kp"), other_kp(joint, float(law.kp) * (1.0 + more)), more
+        stiffer = other_kp(joint, float(law.kp) * (1.0 + more))
+        yield gain_name(joint, "kp"), stiffer, more
     if (damping := float(law.kd + law.emf)) > 0.0:
-        yield _name(joint, "kd"), more_damping(joint, more * damping), more
+        yield gain_name(joint, "kd"), more_damping(joint, more * damping), more

@@ -7,7 +7,7 @@ motion mislead. Here windows are simulated by compiled code
 would do is seen by differences.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -26,7 +26,12 @@ from makebreak.gap.problem import (
     SearchPlan,
     rms,
 )
-from makebreak.gap.residuals.drive_gains import gain_changes, with_moved_gains
+from makebreak.gap.residuals.drive_gains import (
+    gain_changes,
+    gain_name,
+    gains_known_to,
+    with_moved_gains,
+)
 from makebreak.gap.residuals.inverse import LOOP_SEC
 from makebreak.gap.residuals.mechanism import (
     LESS,
@@ -62,11 +67,20 @@ WINDOW_SEC, WITHOUT_LOOP_SEC, MOST_WINDOWS = 2.0, 0.5, 60
 UNKNOWN = 0.1
 # How far a parameter is moved to see what it does, in shares of a typical size.
 SMALL = 0.1
+# Such a move, in deviations of what is known of a parameter beforehand.
+STEP_OF_PRIOR = 0.3
 # Units of the kinds that all joints have in a rich model.
 RICH = ("N m", "N m s/rad", "N m/rad", "kg m2")
+OWN = 0.02  # Of a column, what is no sum of those before it: less says the same.
 LAW = 0.1  # Of such a step: what is smaller may be the law's own error.
+# With which friction may stop joints (DrivenArmScene): of robots, and of MuJoCo's
+# solver as it comes. By how much of the error the second must be better.
+CREEP_SEC, CREEPS = (0.0, 0.001), 0.05
+RICH_STEPS = 16  # Gauss-Newton steps of the fit of all that a joint may have.
+# Columns of links are taken again where they are off by this, over what rows are
+# divided by, so many times at most.
+CURVED, MOST_MOVES = 0.3, 6
 LIMITS = (0.5, 1.0, 1.5, 2.0)  # Of a joint's rms effort, tried as its most.
-FAR_OFF = 10.0  # Times the noise: what is not asked whether the background explains it.
 JOINTS = ("joint", "actuator", "drive")  # Kinds at these act on a joint.
 BEST_SEC = 0.25  # In which the best start is looked for.
 BESIDE_SEC = 0.06  # About a start, within which a jerk spoils what is known of it.
@@ -77,17 +91,23 @@ class DrivenWindows(WindowModel):
     is simulated, too: a stiff drive soon makes it forgotten. Rows are 20 ms apart or
     more: of what a drive follows those between say nothing new.
 
+    Args: creep_sec: see DrivenArmScene.
+
     Raises: DoesNotFit where the scene takes Drake's steps, or no window fits in.
     """
 
     rows_sec = 0.02
 
-    def __init__(self, scene: Scene, recordings: Sequence[Recording]):
+    def __init__(
+        self, scene: Scene, recordings: Sequence[Recording], creep_sec: float = 0.0
+    ):
         self.looped = "position_command" in COMMANDS_OF[scene.actuation.type]
         seconds = WINDOW_SEC if self.looped else WITHOUT_LOOP_SEC
+        self._arms = DrivenArmSimulation(scene)
+        self._arms.set_creep(creep_sec)
         super().__init__(
             scene, recordings, seconds, block_sec=max(seconds, 1.2), most=MOST_WINDOWS,
-            simulation=DrivenArmSimulation(scene),
+            simulation=self._arms,
         )  # fmt: skip
         base = self.simulate(())
         given = self.windows
@@ -141,6 +161,9 @@ class DrivenProblem(DrivenWindows, GapProblem):
         self._told: tuple[Fitted, list[Candidate]] | None = None
         self._slopes: tuple[np.ndarray, list[float], list[str]] | None = None
         self._explained: bool | None = None
+        # Links as they fit best beside the rich model, and what columns say of them.
+        self._links: tuple[Effect, ...] = ()
+        self._moved_by: np.ndarray | None = None
 
     # ----- Residuals
 
@@ -170,12 +193,31 @@ class DrivenProblem(DrivenWindows, GapProblem):
 
     # ----- What models are off by
 
+    def _set_creep(self, seconds: float) -> None:
+        """How far joints creep while friction holds them (DrivenArmScene)."""
+        self._arms.set_creep(seconds)
+        self._forget_nuisances()
+
+    def _forget_nuisances(self) -> None:
+        self._links, self._moved_by = (), None
+        self._base = self._slopes = self._nuisances = None
+
+    def _error_with(self, creep_sec: float) -> float:
+        self._set_creep(creep_sec)
+        return rms(self.base()[self.train()])
+
+    def _best_creep(self, error_of: Callable[[float], float]) -> float:
+        """Of how far joints may creep, what leaves the least error; of two that leave
+        about the same, the smaller."""
+        left = [(error_of(seconds), seconds) for seconds in CREEP_SEC]
+        least = min(left)[0]
+        return min(s for error, s in left if (1.0 - CREEPS) * error <= least)
+
     def is_explained(self) -> bool:
         """Whether the scene as it came, its background within its tolerance, explains
         each channel's windows as well as noise lets it."""
-        if self._explained is None and self.noise_error(self.base()) > FAR_OFF:
-            self._explained = False  # No link within its tolerance does that.
         if self._explained is None:
+            self._set_creep(self._best_creep(self._error_with))
             n = self.nuisances()
             screen = Screen(
                 self.base(), n.columns, n.prior, self.train(), reach=n.reach
@@ -184,8 +226,8 @@ class DrivenProblem(DrivenWindows, GapProblem):
             channel = self.channel_of_rows()
             each = [left[channel == c] for c in np.unique(channel)]
             self._explained = all(rms(x) < MISFIT for x in each)
-            # They are seen beside a rich model, if need be.
-            self._nuisances = self._slopes = None
+            if not self._explained:  # They are seen beside a rich model.
+                self._forget_nuisances()
         return self._explained
 
     def learn_misfit(self) -> None:
@@ -194,17 +236,20 @@ class DrivenProblem(DrivenWindows, GapProblem):
         held = ~self.train()
         if not held.any() or held.all() or self.is_explained():
             return
-        # Of kinds with the same unit one is enough.
-        start: dict[tuple[str, str], Effect] = {}
-        for kind, name, each in self._at_joints():
-            for joint, (now, step) in each.items():
-                unit = KINDS[kind].parameter(name).unit
-                if step and not KINDS[kind].channel and unit in RICH:
-                    effect = Effect(kind, [joint], {name: now + step})
-                    start.setdefault((unit, joint), effect)
         n = Nuisances.none(len(held))
+        small, fits = self._independent(), {}
+
+        def error_of(creep_sec: float) -> float:
+            self._set_creep(creep_sec)
+            screen = Screen(self.base(), n.columns, n.prior, self.train())
+            fit = fit_effects(self, screen, small, evaluations=RICH_STEPS)
+            fits[creep_sec] = fit
+            return fit.fit.train
+
+        creep_sec = self._best_creep(error_of)
+        self._set_creep(creep_sec)
         screen = Screen(self.base(), n.columns, n.prior, self.train())
-        rich = fit_effects(self, screen, list(start.values()), evaluations=5)
+        rich = fits[creep_sec]
         left = rich.r
         if rich.fit.train > screen.evaluate(self.base()).train:  # It went astray.
             left = self.base()
@@ -213,6 +258,51 @@ class DrivenProblem(DrivenWindows, GapProblem):
         self.misfit = np.minimum(self._misfit_of(left), self._misfit_of(self.base()))
         self.correlation = self._correlation_of(left)
         self._base = None
+        self.nuisances()  # Links may move, and the scene's rows with them.
+
+    def prior_rows(self, effects: Sequence[Effect]) -> np.ndarray:
+        """Of what several parameters of a joint can do alike none is large: each is
+        known beforehand to the size that its joint's motion gives it."""
+        rows = []
+        for e in effects:
+            if KINDS[e.kind].at not in JOINTS or "." not in e.at[0]:
+                continue
+            if len(e.parameters) != 1:
+                continue
+            ((name, value),) = e.parameters.items()
+            unit = KINDS[e.kind].parameter(name).unit
+            for joint in e.at:
+                now = self.dynamics.now(e.kind, [joint]).get(name, np.inf)
+                if unit in RICH and now < 1e20:
+                    size = self._step(unit, now, joint) / STEP_OF_PRIOR
+                    rows.append((value - now) / size)
+        return np.array(rows)
+
+    def _independent(self) -> list[Effect]:
+        """Small effects at all joints of the kinds that a joint may have, each with a
+        column of its own: the simpler kind comes first."""
+        found: list[Effect] = []
+        basis: dict[str, np.ndarray] = {}
+        base = self.base()
+        for kind, name, each in self._at_joints():
+            if KINDS[kind].channel or KINDS[kind].parameter(name).unit not in RICH:
+                continue
+            moved = {joint: x + step for joint, (x, step) in each.items() if step}
+            small = [Effect(kind, [j], {name: x}) for j, x in moved.items()]
+            try:
+                off = self.residual(small) - base
+            except ValueError:
+                continue
+            for effect in small:
+                (joint,) = effect.at
+                x = off[self._rows_of(joint)]
+                known = basis.get(joint, np.zeros((len(x), 0)))
+                rest = x - known @ (known.T @ x)
+                size = float(np.linalg.norm(rest))
+                if size > OWN * float(np.linalg.norm(x)):
+                    basis[joint] = np.column_stack([known, rest / size])
+                    found.append(effect)
+        return found
 
     def _misfit_of(self, left: np.ndarray) -> np.ndarray:
         held, of = ~self.train(), self.channel_of_rows()
@@ -250,40 +340,117 @@ class DrivenProblem(DrivenWindows, GapProblem):
     def nuisances(self) -> Nuisances:
         """The links' masses and centres of mass, gains of drives and how late their
         loops are, where all is as it may be (a joint that friction holds hardly shows
-        them)."""
+        them): columns where links are as they fit best, as a weak drive sags too far
+        for what a link does to be seen where the scene has it."""
         if self._nuisances is None:
             if self._slopes is None:
-                self._slopes = self._differences()
-            columns, prior, names = self._slopes
-            self._nuisances = Nuisances.none(len(self.train()))
-            if names:
-                columns = columns / self._divided_by()[:, None]
-                self._nuisances = Nuisances(
-                    columns, np.array(prior), tuple(names), NUISANCE_LIMIT
-                )
+                self._slopes = self._differences(None)
+                for _ in range(MOST_MOVES):
+                    if not self._move_links():
+                        break
+            self._nuisances = self._as_nuisances(self._slopes)
         return self._nuisances
 
-    def _differences(self) -> tuple[np.ndarray, list[float], list[str]]:
+    def _as_nuisances(self, slopes) -> Nuisances:
+        columns, prior, names = slopes
+        if not names:
+            return Nuisances.none(len(self.train()))
+        columns = columns / self._divided_by()[:, None]
+        return Nuisances(columns, np.array(prior), tuple(names), NUISANCE_LIMIT)
+
+    def _move_links(self) -> bool:
+        """Moves the links to where they fit best, and the columns with them; whether
+        that is where columns did not say what they do."""
+        assert self._slopes is not None
+        n = self._as_nuisances(self._slopes)
+        if not n.names:
+            return False
+        left = self.residual(self._rich)
+        screen = Screen(left, n.columns, n.prior, self.train(), reach=n.reach)
+        b, expected = screen.fit_nuisances(left)
+        was = self._links, self._moved_by
+        kinds = tolerances(self.scene)
+        ours = np.array([name.split(" of ", 1)[0] in kinds for name in n.names])
+        self._base = None
+        self._links = tuple(moved_links(self, n, np.where(ours, b, 0.0)))
+        self._moved_by = self._slopes[0] @ np.where(ours, b, 0.0)
+        try:
+            found = self.residual(self._rich) - n.columns @ b
+        except ValueError:  # No scene has such links.
+            self._links, self._moved_by = was
+            return False
+        channel = self.channel_of_rows()
+        curved = any(
+            rms((found - expected)[channel == c]) > CURVED for c in np.unique(channel)
+        )
+        if not curved:
+            self._links, self._moved_by = was
+            return False
+        self._slopes = self._differences(np.where(ours, b, 0.0))
+        # As much as the columns now say of links that are there.
+        self._moved_by = self._slopes[0] @ np.where(ours, b, 0.0)
+        return True
+
+    def residual(self, effects: Sequence[Effect] = ()) -> np.ndarray:
+        """As GapProblem.residual: of links that were moved, with what columns say that
+        they do taken back."""
+        r = super().residual([*self._links, *effects])
+        if self._moved_by is not None:
+            r = r + self._moved_by / self._divided_by()
+        return r
+
+    def _differences(
+        self, moved: np.ndarray | None
+    ) -> tuple[np.ndarray, list[float], list[str]]:
         """What each nuisance does to simulated samples, (m, n_b) over its size; sizes
-        and names."""
+        and names. moved (n_b,): where links are."""
         columns, prior, names = [], [], []
 
-        def simulated(*effects: Effect) -> np.ndarray:
-            each = self.simulate([*self._rich, *effects])
+        def simulated(effects: Sequence[Effect]) -> np.ndarray:
+            each = self.simulate(effects)
             y = np.concatenate([x.ravel() for x in each])[self.measured()]
             return np.where(np.isfinite(y), y, 0.0)
 
-        there = simulated()
+        there = simulated([*self._links, *self._rich])
+        links = list(link_changes(self.dynamics, self.scene))
         changes = [
-            *link_changes(self.dynamics, self.scene), *self._late_loops(),
-            *gain_changes(self.scene, self.joints),
+            *links, *self._late_loops(), *gain_changes(self.scene, self.joints),
         ]  # fmt: skip
-        for name, effect, size in changes:
-            columns.append((simulated(effect) - there) / size)
+        every = tuple(name for name, _, _ in changes)
+        for k, (name, effect, size) in enumerate(changes):
+            with_it = [*self._links, *self._beside_rich(effect)]
+            if k < len(links) and moved is not None:
+                b = np.array(moved)
+                b[k] += size
+                n = Nuisances(np.zeros((0, len(b))), np.ones(len(b)), every)
+                with_it = [*moved_links(self, n, b), *self._rich]
+            columns.append((simulated(with_it) - there) / size)
             prior.append(abs(size))
             names.append(name)
         none = np.zeros((len(there), 0))
         return np.stack(columns, axis=1) if names else none, prior, names
+
+    def _beside_rich(self, effect: Effect) -> list[Effect]:
+        """The rich model with an effect. Where both say what a gain is, the rich one,
+        more by the same share."""
+        out, known = [], False
+        for e in self._rich:
+            if (e.kind, e.at) == (effect.kind, effect.at):
+                ((name, value),) = effect.parameters.items()
+                if KINDS[e.kind].parameter(name).neutral is None:
+                    now = self.dynamics.now(e.kind, e.at)[name]
+                    value = value / now * e.parameters[name]
+                    e, known = Effect(e.kind, e.at, {name: value}), True
+            out.append(e)
+        return out if known else [*out, effect]
+
+    def replaced(self, effects: Sequence[Effect]) -> np.ndarray | None:
+        """A drive's gain that is fitted has no tolerance beside."""
+        n = self._nuisances
+        if n is None:
+            return None
+        fitted = {gain_name(e.at[0]) for e in effects if KINDS[e.kind].drive == "kp"}
+        return np.array([name in fitted for name in n.names])
 
     def _late_loops(self):
         """(name, effect, size) as link_changes, of drives' own loops: a velocity that
@@ -489,7 +656,7 @@ class DrivenProblem(DrivenWindows, GapProblem):
 
     def is_within_tolerance(self, effect: Effect) -> bool:
         """Drives keep time, and friction reverses, as well as laws say it: to 1 % of a
-        gain, of a joint's inertia and of its effort."""
+        joint's inertia and of its effort. Of a gain, what its own tolerance may be."""
         kind, at = effect.kind, effect.at[0]
         if KINDS[kind].at not in JOINTS or len(effect.parameters) != 1:
             return False
@@ -498,6 +665,8 @@ class DrivenProblem(DrivenWindows, GapProblem):
         now = self.dynamics.now(kind, [joint]).get(name, np.inf)
         if not now < 1e20:
             return False
+        if KINDS[kind].drive == "kp":
+            return abs(value - now) < NUISANCE_LIMIT * gains_known_to(self.scene) * now
         size = abs(self._step(KINDS[kind].parameter(name).unit, now, joint))
         return abs(value - now) < LAW * size
 
@@ -521,7 +690,9 @@ class DrivenProblem(DrivenWindows, GapProblem):
         scene = with_moved_gains(self.scene, nuisances.names, end.b)
         if recordings is not None or scene is not self.scene:
             try:
-                model = DrivenWindows(scene, recordings or self.recordings)
+                model = DrivenWindows(
+                    scene, recordings or self.recordings, self._arms.arms.creep_sec
+                )
             except DoesNotFit:  # No window fits in.
                 return None
         held = [recordings is not None or not w.train for w in model.windows]

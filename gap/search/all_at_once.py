@@ -4,65 +4,43 @@ Where friction, a drive's gain and a rotor are off together, each alone explains
 that the first ones to be added stand for the others. Fitted at once each takes its own.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from makebreak.gap.fit import fit_effects, size_of, tangents
-from makebreak.gap.problem import Candidate, Fitted
+from makebreak.gap.fit import fit_effects
+from makebreak.gap.problem import Fitted, rms
 from makebreak.gap.search.choice import Choice, refreshed
 from makebreak.gap.search.comparison import Comparison
-from makebreak.gap.search.groups import with_pruned_groups
-from makebreak.gap.search.screen import Ranked
+from makebreak.gap.thresholds import SAME_ERROR
 from makebreak.models.effects.kind import Effect
 
 
 def all_at_once(search: Comparison) -> tuple[list[Choice], Fitted]:
     """Effects at many joints and their fit, of those that a problem starts from; none
-    where it starts from nothing, or what is left of them explains less.
+    where it starts from nothing.
 
-    Which ones are needed is seen to first order about the fit of all.
+    Kind by kind, those that come last in the catalogue first (a gain that a maker
+    states is off less often than friction is), an effect goes from each joint that its
+    held-out rows do without: they are worse than with all effects by no more than
+    SAME_ERROR. Meanwhile what stands in the place of a nuisance has none beside; in the
+    end what that nuisance may take is no effect.
     """
-    problem, start = search.problem, search.start
-    nothing: tuple[list[Choice], Fitted] = [], start
-    every = problem.rich()
-    if not every:
+    problem = search.problem
+    every = list(problem.rich())
+    nothing: tuple[list[Choice], Fitted] = [], search.start
+    fit = _fit(search, every) if every else None
+    if fit is None:
         return nothing
-    screen = search.screen(start.r)
-    steps = 2 * problem.plan.evaluations
-    try:
-        fit = fit_effects(problem, screen, every, evaluations=steps)
-    except (ValueError, RuntimeError):
+    most = (1.0 + SAME_ERROR) * _errors(search, fit)
+    for kind in reversed(list(dict.fromkeys(e.kind for e in every))):
+        fit = _without(search, fit, kind, most)
+    some = [e for e in fit.effects if not problem.is_within_tolerance(e)]
+    fit = _fit(search, some, alone=False) if some else None
+    if fit is None:
         return nothing
-    slopes = tangents(problem, fit, [()] * len(every))
-    if slopes.shape[1] != len(every):
-        return nothing
-    # To first order, what is left without any of them, and what each takes off it.
-    off = np.array([_value(e) - _now(search, e) for e in fit.effects])
-    columns = -slopes / [size_of(e, next(iter(e.parameters))) for e in fit.effects]
-    r = fit.r + columns @ off
-    members = tuple(
-        Candidate(
-            e.kind, tuple(e.at), 1, (column[:, None],), (_reader(search, e),),
-            least=problem.dynamics.least(e.kind, e.at),
-        )
-        for e, column in zip(fit.effects, columns.T, strict=True)
-    )  # fmt: skip
-    at = tuple(at for m in members for at in m.at)
-    group = Candidate("all", at, len(members), (columns,), (), members=members)
-    wide = search.screen(r, fit.fit.train)
-    ranked = Ranked(group, wide.fit(columns), fit.effects, True, 0)
-    found = with_pruned_groups(search, wide, [ranked])
-    if not found:
-        return nothing
-    kept = {m.at + (m.kind,) for m in found[0].candidate.members}
-    some = [e for e in fit.effects if (*e.at, e.kind) in kept]
-    try:
-        fit = fit_effects(problem, screen, some, evaluations=steps)
-    except (ValueError, RuntimeError):
-        return nothing
-    search.say(f"  {len(some)} of {len(every)} effects at once: {fit.score:.3g}")
-    if not search.error(fit.score) < search.enough(start.score):
-        return nothing
-    before = start.score
+    search.say(f"  {len(fit.effects)} of {len(every)} effects at once: {fit.score:.3g}")
+    before = search.start.score
     choices = [
         Choice(e, {}, before, fit.score, "", np.inf, (), (), 1, in_group=True)
         for e in fit.effects
@@ -70,17 +48,59 @@ def all_at_once(search: Comparison) -> tuple[list[Choice], Fitted]:
     return refreshed(choices, fit), fit
 
 
-def _value(effect: Effect) -> float:
-    (value,) = effect.parameters.values()
-    return value
+def is_worse_somewhere(search: Comparison, one: Fitted, other: Fitted) -> bool:
+    """Whether a channel's held-out rows are worse with the one than with the other."""
+    least = (1.0 - SAME_ERROR) * _errors(search, one)
+    return bool(np.any(_errors(search, other) < least))
 
 
-def _now(search: Comparison, effect: Effect) -> float:
-    (name,) = effect.parameters
-    return search.problem.dynamics.now(effect.kind, effect.at)[name]
+def _without(search: Comparison, fit: Fitted, kind: str, most: np.ndarray) -> Fitted:
+    """The fit less the effects of a kind at joints that do without; it stays as it is
+    where no such fit is found. most (n_channels,): what held-out rows may leave."""
+    kept: set[tuple[str, ...]] = set()
+    while True:
+        some = [e for e in fit.effects if e.kind != kind or tuple(e.at) in kept]
+        if len(some) == len(fit.effects):
+            return fit
+        less = _fit(search, some)
+        if less is None:
+            return fit
+        worse = _errors(search, less) > most
+        if not worse.any():
+            return less
+        of = [c for c in np.unique(search.channel)]
+        gone = [e for e in fit.effects if e.kind == kind and tuple(e.at) not in kept]
+        needed = {
+            tuple(e.at) for e in gone
+            if any(
+                worse[i] and search.problem.moved_by(e)[search.channel == c].any()
+                for i, c in enumerate(of)
+            )
+        }  # fmt: skip
+        # Where a joint is worse by what another one lacks, all of them stay.
+        kept |= needed or {tuple(e.at) for e in gone}
 
 
-def _reader(search: Comparison, effect: Effect):
-    (name,) = effect.parameters
-    now = _now(search, effect)
-    return lambda c: {name: now + float(c[0])}
+def _fit(
+    search: Comparison, effects: Sequence[Effect], alone: bool = True
+) -> Fitted | None:
+    """alone: without the nuisances that any of the rich model's effects replaces."""
+    problem = search.problem
+    screen = search.screen(search.start.r)
+    replaced = problem.replaced(problem.rich()) if alone else None
+    if replaced is not None:
+        screen = screen.without(replaced)
+    try:
+        return fit_effects(
+            problem, screen, effects, evaluations=problem.plan.evaluations
+        )
+    except (ValueError, RuntimeError):
+        return None
+
+
+def _errors(search: Comparison, fit: Fitted) -> np.ndarray:
+    """(n_channels,) rms of held-out rows."""
+    held = ~search.train
+    return np.array(
+        [rms(fit.left[held & (search.channel == c)]) for c in np.unique(search.channel)]
+    )

@@ -11,7 +11,7 @@ from makebreak.gap.fit import derivative_free_search, fit_effects
 from makebreak.gap.problem import Fitted
 from makebreak.gap.result import Considered
 from makebreak.gap.search.add import add_next
-from makebreak.gap.search.all_at_once import all_at_once
+from makebreak.gap.search.all_at_once import all_at_once, is_worse_somewhere
 from makebreak.gap.search.choice import (
     Choice,
     fixed_parameters,
@@ -66,7 +66,7 @@ def forward(search: Comparison) -> Path:
     try:
         path = _step(search, rivals, path)
         chosen, fitted = all_at_once(search)
-        if search.error(fitted.score) < search.enough(path.end.fitted.score):
+        if chosen and is_worse_somewhere(search, path.end.fitted, fitted):
             path = Path((path.states[0], State(tuple(chosen), fitted)), path.table)
         while not path.ended:
             path = _step(search, rivals, path)

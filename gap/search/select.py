@@ -68,8 +68,10 @@ def select(
 def _pruned(
     search: Comparison, chosen: list[Choice], current: Fitted
 ) -> tuple[list[Choice], Fitted]:
+    # Where all that joints may have was fitted at once, what is not needed went there.
+    needless = [] if search.problem.rich() else [drop_needless]
     steps: dict[str, list[Callable]] = {
-        "dropping what is not needed": [drop_needless, simplify],
+        "dropping what is not needed": [*needless, simplify],
         "whether each effect is certain": [keep_certain],
     }
     for what, each in steps.items():

@@ -14,6 +14,7 @@ from makebreak.gap.numerics.driven_arm import (
     LOOP,
     NO_COMMAND,
     DrivenArm,
+    mass_and_bias,
     rollout,
 )
 from makebreak.gap.simulation.scene_simulation import SceneSimulation
@@ -45,7 +46,12 @@ from makebreak.models.effects.kind import (
 from makebreak.models.effects.measured_channels import ChannelMap, channel_maps
 from makebreak.models.scene import Scene, joint_laws, load_scene
 from makebreak.models.scene_schema import COMMANDS_OF, as_kind
+from makebreak.systems.numerics.joint_laws import FADES_AT
 
+# Of the speed below which Drake's friction fades, which its steps need; these are
+# implicit in what a joint's force owes to its speed. At more, a joint that should stay
+# creeps by several times an encoder's noise within a second.
+HOLDS = 0.1
 _MOST_KEPT = 64  # Plants whose numbers are remembered.
 
 
@@ -56,6 +62,10 @@ class DrivenArmScene:
     Contact is left out. Raises: DoesNotFit where anything moves that is no joint of
     one degree of freedom, or effects do what is not in DrivenArm.
     """
+
+    # Time constant with which friction stops a joint, as a damper does, before it
+    # holds: 0 of a robot; MuJoCo's solver, as it comes, has 1 ms, and joints creep.
+    creep_sec = 0.0
 
     def __init__(self, scene: Scene):
         self.scene = scene = replace(scene, plant=replace(scene.plant, time_step=0.0))
@@ -81,7 +91,8 @@ class DrivenArmScene:
             possible = KINDS[effect.kind].possible
             if possible is not None:
                 possible(effect, plant, every)
-        return DrivenArm(**body_numbers, **self._drives(plant, every))
+        arm = DrivenArm(**body_numbers, **self._drives(plant, every))
+        return arm._replace(law_p=self._law_p(plant, arm))
 
     @property
     def has_shapes(self) -> bool:
@@ -96,6 +107,23 @@ class DrivenArmScene:
             np.round(told / np.where(self._step > 0.0, self._step, 1.0)) * self._step,
             told,
         )
+
+    def _law_p(self, plant: MultibodyPlant, arm: DrivenArm) -> np.ndarray:
+        """(m, 4) with dry friction that holds: below a speed that is no more than these
+        steps need, or with which a joint creeps in so far as the scene's does."""
+        p = arm.law_p.copy()
+        dry = [j for j, kind in enumerate(arm.law_kind) if int(kind) in FADES_AT]
+        if not dry:
+            return p
+        n = len(arm.parent)
+        q = plant.GetPositions(plant.CreateDefaultContext())
+        mass_and_bias(arm, q, np.zeros(n), M := np.empty((n, n)), np.empty(n))
+        mobility = np.diag(np.linalg.inv(M))
+        for j in dry:
+            at, i = FADES_AT[int(arm.law_kind[j])], int(arm.law_joint[j])
+            creeps = self.creep_sec * np.abs(p[j, : min(at, 2)]).max() * mobility[i]
+            p[j, at] = max(HOLDS * p[j, at], creeps)
+        return p
 
     def _plant(self, effects) -> tuple[MultibodyPlant, dict]:
         """A plant with these effects, and what of a DrivenArm it decides."""
@@ -166,6 +194,11 @@ class DrivenArmSimulation(SceneSimulation):
         self.tol = 1e-3
         self._own = len(scene.effects)
         self._arm = self.arms.arm(())
+
+    def set_creep(self, seconds: float) -> None:
+        """See DrivenArmScene.creep_sec."""
+        self.arms.creep_sec = seconds
+        self.set_effects(self._scene.effects)
 
     def set_effects(self, effects: Sequence[Effect]) -> None:
         """The scene's effects from now on, of which the scene's own come first."""

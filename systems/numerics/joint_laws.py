@@ -50,6 +50,9 @@ def spring_law(q, v, t, p):
 
 
 LAWS = (coulomb_law, direction_law, stribeck_law, drag_law, ripple_law, spring_law)
+# Where in p the speed is below which a law of dry friction fades; what is before it are
+# its frictions, and a Stribeck velocity.
+FADES_AT = {0: 1, 1: 2, 2: 3}
 
 
 @numba.njit(cache=True)
