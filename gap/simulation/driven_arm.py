@@ -84,9 +84,13 @@ class DrivenArmScene:
             if not can_have(effect.kind):
                 raise DoesNotFit(f"effect {effect.kind} takes Drake's own steps")
         plant, body_numbers = self._plant([e for e in every if _in_plant(e.kind)])
-        own = [e for e in every if _of_joint(e.kind)]
-        if own:
-            body_numbers = {**body_numbers, **_with_joints(plant, own)}
+        links = [e for e in every if _of_link(e.kind)]
+        joints = [e for e in every if _of_joint(e.kind)]
+        if links or joints:
+            context = _changed(plant, [*links, *joints])
+            if links:
+                body_numbers = _tree(plant, context)
+            body_numbers = {**body_numbers, **_joint_numbers(plant, context)}
         for effect in every:
             possible = KINDS[effect.kind].possible
             if possible is not None:
@@ -243,7 +247,8 @@ def can_have(kind: str) -> bool:
 
 def _in_plant(kind: str) -> bool:
     entry = KINDS[kind]
-    return not (entry.joint_law or entry.path or entry.channel or _of_joint(kind))
+    elsewhere = entry.joint_law or entry.path or entry.channel
+    return not (elsewhere or _of_joint(kind) or _of_link(kind))
 
 
 def _of_joint(kind: str) -> bool:
@@ -253,8 +258,14 @@ def _of_joint(kind: str) -> bool:
     return bool(entry.at == "joint" and entry.set_in_context and numbers == [0.0])
 
 
-def _with_joints(plant: MultibodyPlant, effects: Sequence[Effect]) -> dict:
-    """Rotors and damping of a plant whose joints have these effects, too.
+def _of_link(kind: str) -> bool:
+    """Whether it changes the inertia of a link that is there, without another plant."""
+    entry = KINDS[kind]
+    return bool(entry.at == "body" and entry.set_in_context and entry.edit_text)
+
+
+def _changed(plant: MultibodyPlant, effects: Sequence[Effect]):
+    """A Context of a plant whose links and joints have these effects, too.
 
     Raises: ValueError for effects that it cannot have.
     """
@@ -264,7 +275,7 @@ def _with_joints(plant: MultibodyPlant, effects: Sequence[Effect]) -> dict:
         assert change is not None
         none = dict.fromkeys(effect.parameters, 0.0)
         change(Effect(effect.kind, effect.at, none), effect, plant, context)
-    return _joint_numbers(plant, context)
+    return context
 
 
 def _joint_numbers(plant: MultibodyPlant, context) -> dict:
@@ -279,8 +290,10 @@ def _joint_numbers(plant: MultibodyPlant, context) -> dict:
     return dict(rotor=rotor, damping=damping)
 
 
-def _tree(plant: MultibodyPlant) -> dict:
+def _tree(plant: MultibodyPlant, context=None) -> dict:
     """The joints and links of a plant, as of a DrivenArm.
+
+    context: with its inertias; None: the plant's own.
 
     Raises: DoesNotFit for anything else that moves, or pulls.
     """
@@ -297,7 +310,7 @@ def _tree(plant: MultibodyPlant) -> dict:
         raise DoesNotFit("expected joints that turn or slide")
     if plant.num_force_elements() > 1:
         raise DoesNotFit("expected no force elements but gravity")
-    context = plant.CreateDefaultContext()
+    context = context or plant.CreateDefaultContext()
     plant.SetPositions(context, np.zeros(n))
     carried = {j.child_body().index(): i for i, j in enumerate(joints)}
     inner = {
