@@ -77,7 +77,13 @@ def outcomes(monkeypatch, error):
         _model=lambda: SimpleNamespace(windows=[]), _again=windows
     )
     problem = SimpleNamespace(
-        scene=None, recordings=[], tracks=[], _windows=None, lying=list, pressed=list
+        scene=None,
+        recordings=[],
+        tracks=[],
+        _windows=None,
+        lying=list,
+        pressed=list,
+        creep_sec=0.0,
     )
     end = SimpleNamespace(b=None)
     names = SimpleNamespace(names=())

@@ -103,6 +103,7 @@ class DrivenWindows(WindowModel):
     ):
         self.looped = "position_command" in COMMANDS_OF[scene.actuation.type]
         seconds = WINDOW_SEC if self.looped else WITHOUT_LOOP_SEC
+        self.creep_sec = creep_sec
         self._arms = DrivenArmSimulation(scene)
         self._arms.set_creep(creep_sec)
         super().__init__(
@@ -195,6 +196,7 @@ class DrivenProblem(DrivenWindows, GapProblem):
 
     def _set_creep(self, seconds: float) -> None:
         """How far joints creep while friction holds them (DrivenArmScene)."""
+        self.creep_sec = seconds
         self._arms.set_creep(seconds)
         self._forget_nuisances()
 
@@ -691,7 +693,7 @@ class DrivenProblem(DrivenWindows, GapProblem):
         if recordings is not None or scene is not self.scene:
             try:
                 model = DrivenWindows(
-                    scene, recordings or self.recordings, self._arms.arms.creep_sec
+                    scene, recordings or self.recordings, self.creep_sec
                 )
             except DoesNotFit:  # No window fits in.
                 return None
