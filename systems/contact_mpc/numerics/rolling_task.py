@@ -173,7 +173,7 @@ class ApproachConfig:
     # Depth below the believed surface at which it ends for a tip that has to feel for
     # the ball, in standard deviations of the gap.
     n_std_below: float = 1.5
-    speed: float = 0.035  # [m/s]
+    speed: float = 0.035  # Speed of the approach [m/s].
     max: float = 0.025  # Longest distance [m].
     # Vertical force, beyond that in the air, which is a touch [N].
     touch_force: float = 4.0
