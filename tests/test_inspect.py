@@ -86,6 +86,8 @@ def test_mondays_sidecar_serves_fridays_log_and_it_is_said(folder, capsys):
     out = capsys.readouterr().out
     assert "friday.csv has no sidecar: columns as in monday.yaml" in out
     assert "arm.joint1.position x 0.5" in out and "ignore" not in out
+    assert main(["inspect", str(robot), str(log)]) == 0  # As `gap` takes them.
+    assert capsys.readouterr().out == out
     scene = folder / "scenes" / "scene.yaml"
     scene.parent.mkdir()
     scene.write_text("directives: []\n")

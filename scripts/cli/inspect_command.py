@@ -219,10 +219,17 @@ def run_inspect(
     sidecar: Path | None,
 ) -> tuple[Inspection, list[Path]]:
     """What the logs hold, and the files written. Of several, one that cannot be read is
-    told and stops nothing; a robot's file that lies alone in a folder of logs is used.
+    told and stops nothing; a robot's file among them, or alone in a folder of logs, is
+    used.
 
     Raises: ValueError, one line, for a log or a robot that cannot be read.
     """
+    robots = [
+        w for w in words if Path(w).suffix.lower() in ROBOTS and Path(w).is_file()
+    ]
+    if robot_path is None and len(robots) == 1 < len(words):  # As for `gap`.
+        robot_path = Path(robots[0])
+        words = [word for word in words if word != robots[0]]
     paths, notes = recording_files(words), list[str]()
     if robot_path is None:
         here = [file for word in words if Path(word).is_dir()
