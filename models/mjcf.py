@@ -5,7 +5,7 @@ and no reference positions. So MuJoCo compiles the file, and Drake gets one that
 only what it reads exactly: bodies, explicit inertias, joints, shapes.
 """
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -62,7 +62,15 @@ def _compiled(path: Path):
     try:
         spec = mujoco.MjSpec.from_file(str(path))
         left_out = _without_lost_meshes(spec, path.parent)
-        model = spec.compile()
+        try:
+            model = spec.compile()
+        except ValueError:
+            unreadable = _unreadable_meshes(spec, path.parent)
+            if not unreadable:
+                raise
+            spec = mujoco.MjSpec.from_file(str(path))
+            left_out = _without_lost_meshes(spec, path.parent, unreadable)
+            model = spec.compile()
     except ValueError as error:
         raise ValueError(f"{path}: MuJoCo says: {' '.join(str(error).split())}") from (
             None
@@ -71,9 +79,28 @@ def _compiled(path: Path):
     return model, path.stem if name in ("", "MuJoCo Model") else name, left_out
 
 
-def _without_lost_meshes(spec, folder: Path) -> int:
+def _unreadable_meshes(spec, folder: Path) -> set[str]:
+    """Files of meshes that MuJoCo cannot load, such as pointers in their place of a
+    checkout without Git LFS."""
+    import mujoco
+
+    found = set()
+    for mesh in spec.meshes:
+        one = mujoco.MjSpec()
+        one.add_mesh(name="one", file=str((folder / spec.meshdir / mesh.file).resolve()))
+        one.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="one")
+        try:
+            one.compile()
+        except ValueError:
+            found.add(mesh.file)
+    return found
+
+
+def _without_lost_meshes(spec, folder: Path, unreadable: Container[str] = ()) -> int:
     """Takes out meshes that are not there, with their shapes, and textures. Returns:
     how many shapes could have touched something.
+
+    Args: unreadable: files that are as good as not there.
 
     Raises: ValueError where a body's inertia is that of such a shape.
     """
@@ -88,7 +115,7 @@ def _without_lost_meshes(spec, folder: Path) -> int:
                 material.textures = ["" for _ in material.textures]
             spec.delete(texture)
     gone = {m.name or Path(m.file).stem: m for m in spec.meshes
-            if lost(m.file, spec.meshdir)}  # fmt: skip
+            if lost(m.file, spec.meshdir) or m.file in unreadable}  # fmt: skip
     count = 0
     by_shapes = int(spec.compiler.inertiafromgeom) == 1  # mjINERTIAFROMGEOM_TRUE
     for geom in list(spec.geoms) if gone else []:

@@ -232,10 +232,16 @@ def test_what_is_left_out_is_told(tmp_path):
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
 
 
+POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n"
+
+
+@pytest.mark.parametrize("file", [None, POINTER], ids=["missing", "pointer"])
 @pytest.mark.parametrize("touches, count", [(0, 0), (1, 1)])
 def test_a_mesh_that_is_not_there_stops_nothing_where_nothing_is_touched(
-    touches, count, tmp_path
+    touches, count, file, tmp_path
 ):
+    if file is not None:
+        (tmp_path / "gone.stl").write_text(file)
     asset = '<asset><mesh name="m" file="gone.stl"/></asset>'
     geom = f'<geom type="mesh" mesh="m" contype="{touches}" conaffinity="{touches}"/>'
     text = arm(top=asset, fore=FORE + geom)
