@@ -87,7 +87,9 @@ def _unreadable_meshes(spec, folder: Path) -> set[str]:
     found = set()
     for mesh in spec.meshes:
         one = mujoco.MjSpec()
-        one.add_mesh(name="one", file=str((folder / spec.meshdir / mesh.file).resolve()))
+        one.add_mesh(
+            name="one", file=str((folder / spec.meshdir / mesh.file).resolve())
+        )
         one.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="one")
         try:
             one.compile()
