@@ -428,8 +428,8 @@ def make_parser(functions: Mapping[str, Callable]) -> argparse.ArgumentParser:
     p.add_argument(
         "names", nargs="*", metavar="NAME",
         help="c3, lcs, learner, impedance, push, camera, latency, diagrams or gap "
-        "(default: all of these); c3_light, learner_plants, parameter_learner: "
-        "accuracy on small plants",
+        "(default: all of these); c3_light, learner_plants, parameter_learner, "
+        "parameter_push: accuracy on small plants",
     )  # fmt: skip
 
     p = commands.add_parser("completion", help="print the script for tab completion")
