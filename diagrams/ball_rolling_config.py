@@ -10,6 +10,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.diagrams.camera import CameraConfig
 from makebreak.diagrams.fault_kinds import read_faults
+from makebreak.diagrams.learned_parameters import to_learn
 from makebreak.diagrams.sampled_contacts import SampledContactsConfig
 from makebreak.diagrams.scene_facts import sphere_radius
 from makebreak.diagrams.station import ARM, BALL_ROLLING, TOOL, StationFaults
@@ -364,22 +365,13 @@ def learned_parameters(config: BallRollingConfig) -> list[Parameter]:
     if not config.adapt or config.learner != "parameters":
         return []
     own = config.parameters
-    for name in ("mass", "friction", "rolling", "gap"):
-        if not getattr(own, name) >= 0.0:
-            raise ValueError(
-                f"parameters.{name} is {getattr(own, name)}, expected >= 0"
-            )
-    items = [
+    return to_learn(own, ("mass", "friction", "rolling", "gap"), lambda: [
         Parameter("mass", own.mass, "ball"),
         Parameter("friction", own.friction, pairs=[0]),
         Parameter("friction", own.friction, pairs=[1]),
         Parameter("rolling", own.rolling, pairs=[1]),
         Parameter("gap", own.gap, pairs=[0]),
-    ]
-    learned = [item for item in items if item.std > 0.0]
-    if not learned:
-        raise ValueError("parameters has no deviation above 0, expected one to learn")
-    return learned
+    ])  # fmt: skip
 
 
 def parameter_learner_config(

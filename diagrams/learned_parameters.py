@@ -1,6 +1,7 @@
 """The wiring of a ParameterLearner beside planners that know gaps as a residual."""
 
 import re
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from pydrake.systems.framework import (
@@ -13,7 +14,27 @@ from pydrake.systems.framework import (
 from pydrake.systems.primitives import MatrixGain
 
 from makebreak.diagrams import wiring
+from makebreak.systems.contact_mpc.multibody.model_parameters import Parameter
 from makebreak.systems.contact_mpc.parameter_learner import ParameterLearner
+
+
+def to_learn(
+    own, names: Sequence[str], items: Callable[[], list[Parameter]]
+) -> list[Parameter]:
+    """Those of the items whose deviation is not 0.
+
+    Args: own: an experiment's settings `parameters`, whose `names` are deviations.
+    Raises: ValueError for one below 0, or none above.
+    """
+    for name in names:
+        if not getattr(own, name) >= 0.0:
+            raise ValueError(
+                f"parameters.{name} is {getattr(own, name)}, expected >= 0"
+            )
+    learned = [item for item in items() if item.std > 0.0]
+    if not learned:
+        raise ValueError("parameters has no deviation above 0, expected one to learn")
+    return learned
 
 
 def add_parameter_learner(

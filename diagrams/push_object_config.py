@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 
 from makebreak.diagrams.camera import CameraConfig
+from makebreak.diagrams.learned_parameters import to_learn
 from makebreak.models.model_files import MODELS
 from makebreak.models.pushed_object import PushedObject, support_spheres
 from makebreak.systems.arm.arm_reference import (
@@ -307,25 +308,16 @@ def learned_parameters(config: PushObjectConfig) -> list[Parameter]:
     if not config.adapt or config.learner != "parameters":
         return []
     own = config.parameters
-    for name in ("mass", "friction", "gap", "com"):
-        if not getattr(own, name) >= 0.0:
-            raise ValueError(
-                f"parameters.{name} is {getattr(own, name)}, expected >= 0"
-            )
     n = len(support_spheres(config.object)[0])
     table = list(range(1, n + 1))
-    items = [
+    return to_learn(own, ("mass", "friction", "gap", "com"), lambda: [
         Parameter("mass", own.mass, OBJECT),
         Parameter("com_x", own.com, OBJECT),
         Parameter("com_y", own.com, OBJECT),
         Parameter("friction", own.friction, pairs=[0]),
         Parameter("friction", own.friction, pairs=table),
         Parameter("gap", own.gap, pairs=[0]),
-    ]
-    learned = [item for item in items if item.std > 0.0]
-    if not learned:
-        raise ValueError("parameters has no deviation above 0, expected one to learn")
-    return learned
+    ])  # fmt: skip
 
 
 def parameter_learner_config(

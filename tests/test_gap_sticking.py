@@ -66,6 +66,23 @@ def goals(n, rng):
     return time, out
 
 
+def log_of(truth, joints, folder, time, told, read):
+    """The log of a scene that follows commands told (n, m), as encoders `read` its
+    positions (m, n); names of the positions."""
+    names = [f"{joint}.position" for joint in joints]
+    columns = {f"{j}.position_command": u for j, u in zip(joints, told, strict=True)}
+    rows = DrivenArmSimulation(truth).run(
+        at_rest_but(dict(zip(joints, told[:, 0], strict=True))),
+        time, names, Commands(time, columns),
+    )  # fmt: skip
+    file = folder / "recording.csv"
+    np.savetxt(
+        file, np.column_stack([time, read(rows), *told]), delimiter=",", comments="",
+        header=",".join(["time", *names, *columns]), fmt="%.9g",
+    )  # fmt: skip
+    return file, names
+
+
 def recorded(folder, arm, hidden, seed=0):
     """A scene, and a recording of it in which `hidden` acts as well."""
     rng = np.random.default_rng(seed)
@@ -73,19 +90,11 @@ def recorded(folder, arm, hidden, seed=0):
     truth = with_effects(scene, *hidden)
     truth = replace(scene, effects=[*scene.effects, *truth.effects])
     time, told = goals(len(joints), rng)
-    names = [f"{joint}.position" for joint in joints]
-    columns = {f"{j}.position_command": u for j, u in zip(joints, told, strict=True)}
-    rows = DrivenArmSimulation(truth).run(
-        at_rest_but(dict(zip(joints, told[:, 0], strict=True))),
-        time, names, Commands(time, columns),
-    )  # fmt: skip
-    rows = np.round((rows + 2e-4 * rng.normal(size=rows.shape)) / STEP) * STEP
-    header = ["time", *names, *(f"{joint}.position_command" for joint in joints)]
-    file = folder / "recording.csv"
-    np.savetxt(
-        file, np.column_stack([time, rows, *told]), delimiter=",", comments="",
-        header=",".join(header), fmt="%.9g",
-    )  # fmt: skip
+
+    def read(rows):
+        return np.round((rows + 2e-4 * rng.normal(size=rows.shape)) / STEP) * STEP
+
+    file, names = log_of(truth, joints, folder, time, told, read)
     said = "".join(f"  {name}: {STEP / np.sqrt(12.0):.3g}\n" for name in names)
     file.with_suffix(".yaml").write_text("noise:\n" + said)
     write_scene(scene, folder / "scene.yaml")
@@ -327,18 +336,10 @@ def test_links_within_their_tolerance_explain_a_joint_that_a_weak_drive_lets_sag
     moved = ("object_com", "d.lower", at | {"x": at["x"] + 0.05, "z": at["z"] - 0.02})
     truth = with_effects(weak, moved)
     time, told = goals(2, np.random.default_rng(3))
-    names = [f"{joint}.position" for joint in joints]
-    columns = {f"{j}.position_command": u for j, u in zip(joints, told, strict=True)}
-    rows = DrivenArmSimulation(truth).run(
-        at_rest_but(dict(zip(joints, told[:, 0], strict=True))),
-        time, names, Commands(time, columns),
-    )  # fmt: skip
-    rows += 2e-4 * np.random.default_rng(4).normal(size=rows.shape)
-    header = ["time", *names, *(f"{joint}.position_command" for joint in joints)]
-    file = tmp_path / "recording.csv"
-    np.savetxt(
-        file, np.column_stack([time, rows, *told]), delimiter=",", comments="",
-        header=",".join(header), fmt="%.9g",
+    noise = np.random.default_rng(4)
+    file, _ = log_of(
+        truth, joints, tmp_path, time, told,
+        lambda rows: rows + 2e-4 * noise.normal(size=rows.shape),
     )  # fmt: skip
     problem = DrivenProblem(weak, read_recordings([file]))
     assert problem.noise_error(problem.base()) > 20.0

@@ -37,6 +37,17 @@ def is_dataset(path: Path) -> bool:
     return (path / "meta" / "info.json").is_file()
 
 
+def rosbags(module: str, who_needs: str):
+    """A module of rosbags, and the types of ROS 2. Raises: ValueError, one line that
+    begins with `who_needs`, where it is not installed."""
+    try:
+        found = import_module(f"rosbags.{module}")
+        typesys = import_module("rosbags.typesys")
+    except ImportError:
+        raise ValueError(f"{who_needs} rosbags: pip install 'makebreak[ros]'") from None
+    return found, typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+
+
 def read_bag(
     path: Path, unused: frozenset[str] = frozenset()
 ) -> tuple[dict[str, np.ndarray], list[tuple[str, str]]]:
@@ -45,14 +56,7 @@ def read_bag(
 
     Raises: ValueError, one line.
     """
-    try:
-        highlevel = import_module("rosbags.highlevel")
-        typesys = import_module("rosbags.typesys")
-    except ImportError:
-        raise ValueError(
-            f"recording {path}: bags need rosbags: pip install 'makebreak[ros]'"
-        ) from None
-    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    highlevel, store = rosbags("highlevel", f"recording {path}: bags need")
     topics: list[str] = []
     stamps: list[tuple[int, int]] = []  # [ns] Of the header, 0 if none; of the bag.
     rows: list[dict[str, float]] = []

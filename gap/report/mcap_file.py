@@ -25,6 +25,7 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex
 
+from makebreak.gap.data.bags import rosbags
 from makebreak.gap.data.recording import QUATERNION, Recording
 from makebreak.gap.data.table import TWIST, WRENCH
 from makebreak.gap.report.comparison import (
@@ -75,14 +76,7 @@ def write_mcap(
     Returns: sentences of what was moved.
     Raises: ValueError if rosbags, which writes the file, is not installed.
     """
-    try:
-        rosbag2 = import_module("rosbags.rosbag2")
-        typesys = import_module("rosbags.typesys")
-    except ImportError:
-        raise ValueError(
-            f"{path.name}: MCAP needs rosbags: pip install 'makebreak[ros]'"
-        ) from None
-    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    rosbag2, store = rosbags("rosbag2", f"{path.name}: MCAP needs")
     messages = _Messages(store.types)
     starts, notes = _starts(motions)
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:

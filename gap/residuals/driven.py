@@ -103,7 +103,6 @@ class DrivenWindows(WindowModel):
     ):
         self.looped = "position_command" in COMMANDS_OF[scene.actuation.type]
         seconds = WINDOW_SEC if self.looped else WITHOUT_LOOP_SEC
-        self.creep_sec = creep_sec
         self._arms = DrivenArmSimulation(scene)
         self._arms.set_creep(creep_sec)
         super().__init__(
@@ -121,6 +120,11 @@ class DrivenWindows(WindowModel):
         self.windows = [
             replace(w, std=np.sqrt(of)) for w, of in zip(given, variance, strict=True)
         ]
+
+    @property
+    def creep_sec(self) -> float:
+        """How far joints creep while friction holds them (DrivenArmScene)."""
+        return self._arms.arms.creep_sec
 
     def _best_start(self, time, states, row: int) -> int:
         """Of the next BEST_SEC, the row about which accelerations jump least: a joint
@@ -195,8 +199,7 @@ class DrivenProblem(DrivenWindows, GapProblem):
     # ----- What models are off by
 
     def _set_creep(self, seconds: float) -> None:
-        """How far joints creep while friction holds them (DrivenArmScene)."""
-        self.creep_sec = seconds
+        """Sets creep_sec, with which nuisances do something else."""
         self._arms.set_creep(seconds)
         self._forget_nuisances()
 

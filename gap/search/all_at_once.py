@@ -68,13 +68,12 @@ def _without(search: Comparison, fit: Fitted, kind: str, most: np.ndarray) -> Fi
         worse = _errors(search, less) > most
         if not worse.any():
             return less
-        of = [c for c in np.unique(search.channel)]
         gone = [e for e in fit.effects if e.kind == kind and tuple(e.at) not in kept]
         needed = {
             tuple(e.at) for e in gone
             if any(
-                worse[i] and search.problem.moved_by(e)[search.channel == c].any()
-                for i, c in enumerate(of)
+                search.problem.moved_by(e)[search.channel == c].any()
+                for c in np.unique(search.channel)[worse]
             )
         }  # fmt: skip
         # Where a joint is worse by what another one lacks, all of them stay.

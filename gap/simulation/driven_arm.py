@@ -90,7 +90,8 @@ class DrivenArmScene:
             context = _changed(plant, [*links, *joints])
             if links:
                 body_numbers = _tree(plant, context)
-            body_numbers = {**body_numbers, **_joint_numbers(plant, context)}
+            else:
+                body_numbers = {**body_numbers, **_joint_numbers(plant, context)}
         for effect in every:
             possible = KINDS[effect.kind].possible
             if possible is not None:
