@@ -109,6 +109,32 @@ def test_one_joint_of_a_group_goes_and_the_others_stay():
     assert choice.effect.at == ["arm.j2"] and "from 4.8 to 8.6" in why
 
 
+@pytest.mark.parametrize("others, gone", [(2.0, ["arm.j2"]), (18.0, [])])
+def test_of_a_group_goes_what_is_needless_unless_other_joints_are_worse_without(
+    others, gone
+):
+    """j2 is better without the group, but j1 is not; `others`: its error where j2 alone
+    goes without."""
+    every = {j: Effect(KIND, [j], {"coulomb": 4.0}) for j in JOINTS}
+
+    def judge(some):
+        there = {at for e in some.effects() for at in e.at}
+        after = {"arm.j1": 18.0 if "arm.j1" not in there else 2.0, "arm.j2": 3.9,
+                 "arm.j3": 2.0 if "arm.j3" in there else 9.0}  # fmt: skip
+        if "arm.j2" not in there:
+            after |= {"arm.j2": 3.4, "arm.j1": max(others, after["arm.j1"])}
+        shown = Held({j: (20.0, x) for j, x in after.items()})
+        return shown.outcome(list(every.values()), None, None, None)
+
+    problem = Held({j: (20.0, 2.0) for j in JOINTS})
+    selection = selection_of(problem)
+    *group, alone = selection.choices
+    choices = (*group, replace(alone, in_group=False))
+    found = confirmed(problem, replace(selection, choices=choices), judge)
+    assert [c.effect.at[0] for c, _ in found.vetoed] == gone
+    assert all("from 3.4 to 3.9" in why for _, why in found.vetoed)
+
+
 def test_a_joint_s_own_equation_vetoes_too():
     class WithEquations(Held):
         def outcome(self, effects, *of, **more):
