@@ -12,13 +12,18 @@ With contact_sequence=sampled diagrams/sampled_contacts.py takes rolling_task's 
 Nothing passes from the world to the controllers but encoders, torques and pictures.
 """
 
-from dataclasses import replace
-from functools import partial
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem, OutputPort
+from pydrake.systems.framework import (
+    Diagram,
+    DiagramBuilder,
+    LeafSystem,
+    OutputPort,
+    System,
+)
 from pydrake.systems.primitives import (
     Adder,
     ConstantVectorSource,
@@ -69,7 +74,7 @@ from makebreak.diagrams.wiring import (
 )
 from makebreak.models.fruit import FRUITS
 from makebreak.models.scene import Scene
-from makebreak.models.tip_and_ball import make_tip_and_ball
+from makebreak.models.tip_and_ball import TipAndBall, make_tip_and_ball
 from makebreak.systems.arm.arm_reference import (
     ArmReference,
     ArmReferenceConfig,
@@ -85,7 +90,7 @@ from makebreak.systems.baselines.dynamics_residual_learner import (
     DynamicsResidualLearner,
     DynamicsResidualLearnerConfig,
 )
-from makebreak.systems.contact_mpc.c3_mpc import C3Mpc
+from makebreak.systems.contact_mpc.c3_mpc import C3Config, C3Mpc
 from makebreak.systems.contact_mpc.lcs_builder import (
     AnitescuLcs,
     AnitescuLcsBuilder,
@@ -188,6 +193,68 @@ _OWN = {
 }
 
 
+@dataclass(frozen=True, eq=False)
+class _Rig:
+    """What each part of the experiment is wired to."""
+
+    builder: DiagramBuilder
+    config: BallRollingConfig
+    meshcat: Meshcat | None
+    model: TipAndBall  # What the controllers believe.
+    station: Diagram
+    arm: MultibodyPlant  # Of the controllers.
+    lcs: dict[str, LeafSystem]  # "plan", "command" and "learn".
+    lcs_of: dict[str, AnitescuLcs]  # What these build with.
+    estimator: StateEstimator
+
+    @property
+    def n_lam(self) -> int:
+        return self.lcs_of["plan"].n_lam
+
+    @property
+    def p_tip(self) -> np.ndarray:
+        """(3,) where the tip starts [m]."""
+        tip = self.arm.GetFrameByName(TIP_FRAME)
+        return tip.CalcPoseInWorld(self.arm.CreateDefaultContext()).translation()
+
+    def add(self, name: str, system):
+        return self.builder.AddNamedSystem(name, system)
+
+    def connect(self, source: System, output: str, target: System, port: str) -> None:
+        wiring.connect(self.builder, source, output, target, port)
+
+    def feed(self, source: OutputPort, target: System, port: str) -> None:
+        self.builder.Connect(source, target.GetInputPort(port))
+
+    def mean_of_tip(self, name: str, r_comp: OutputPort, scale: float) -> OutputPort:
+        """(1,) scale times the mean of the entries of r_comp for tip and ball."""
+        mean = np.zeros((1, self.n_lam))
+        mean[0, :N_TIP] = scale / N_TIP
+        gain = self.add(name, MatrixGain(mean))
+        self.builder.Connect(r_comp, gain.get_input_port())
+        return gain.get_output_port()
+
+
+@dataclass(frozen=True, eq=False)
+class _Learned:
+    """What a learner gives: r_comp (n_lam,) and its deviation, (1,) [m/s]."""
+
+    r_comp: OutputPort
+    r_std: OutputPort | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class _Touches:
+    """How it is chosen where the tip touches: the system that moves it there, the one
+    that says where the ball shall go, and what C3 and the arm's reference are set to.
+    """
+
+    task: LeafSystem
+    target: LeafSystem
+    c3: C3Config
+    reference: ArmReferenceConfig
+
+
 def add_ball_rolling(
     builder: DiagramBuilder,
     config: BallRollingConfig,
@@ -204,175 +271,73 @@ def add_ball_rolling(
         control, which nothing here asks for; station, in place of the simulated world:
         it has the sensors' ports, but may lack the truth and the wrench, and have ball
         positions (`ball.p_WB`, `ball.v_WB`, `ball.seen`) in place of pictures;
-        follow_hard: of the arm's reference.
+        follow_hard: of the arm's reference, which sampled contacts do not have.
     """
-    check_own(config, _OWN)
-    model, model_scene = controller_model(config)
-    learner_kind = config.learner if config.adapt else "none"
-    projection = config.projection
-    if projection == "auto":
-        projection = "qp" if config.controller == "paper" else "plus"
-    samples = config.contact_sequence == "sampled"
-    if samples:
-        _check_sampled(config, projection, learner_kind)
-    _refuse_unused(config)
-    wrong = what_goes_wrong(config)
+    _check(config)
     if station is None:
         station = make_world(config, meshcat, sampled)
+    model, scene = controller_model(config)
+    arm = make_control_plant(scene)
     station = builder.AddNamedSystem("station", station)
-    arm = make_control_plant(model_scene)
-    tip = arm.GetFrameByName(TIP_FRAME)
-    p_tip = tip.CalcPoseInWorld(arm.CreateDefaultContext()).translation()
-
-    items = learned_parameters(config)
-    lcs, lcs_of = _add_models(builder, config, model, items)
-    n_lam = lcs_of["plan"].n_lam
+    lcs, lcs_of = _add_models(builder, config, model)
     estimator = _add_sensing(builder, config, model, station, arm)
-    task: LeafSystem
-    if samples:
-        c3_settings = sampled_c3_config(
-            config.contacts.planner, n_lam, N_TIP, model.ball_radius, LEARN
-        )
-        circle = PathTargetConfig(center=config.task.center, radius=config.task.radius)
-        contacts = add_sampled_contacts(
-            builder, config.contacts, circle, model, lcs_of["plan"], c3_settings, p_tip,
-            N_TIP, CONTROL, OFFSET, estimator,
-        )  # fmt: skip
-        task, target = contacts.task, contacts.target
-        reference_settings = replace(
-            config.contacts.reference, height=config.contacts.sampler.sampling.height
-        )
-    else:
-        c3_settings = c3_config(config.planner, n_lam, projection)
-        target = task = _add_cycle(builder, config, model, n_lam, p_tip)
-        reference_settings = ArmReferenceConfig(follow=FollowConfig(hard=follow_hard))
-    c3 = builder.AddNamedSystem("c3_mpc", C3Mpc(c3_settings, CONTROL, OFFSET["c3"]))
-    reference = builder.AddNamedSystem(
-        "arm_reference",
-        ArmReference(
-            replace(
-                reference_settings,
-                tip_mass=model.tip_mass,
-                period_sec=CONTROL,
-                offset_sec=OFFSET["reference"],
-            ),
-            n_lam,
-            p_tip,
-            lcs_of["command"].at_default(),
-        ),
-    )
-    impedance = builder.AddNamedSystem(
-        "impedance_controller",
-        ImpedanceController(
-            replace(
-                config.impedance, period_sec=ARM_TICK, offset_sec=OFFSET["impedance"]
-            ),
-            arm,
-            TIP_FRAME,
-            hybrid=hybrid,
-            laws=control_laws(model_scene, arm),
-        ),
-    )
+    rig = _Rig(builder, config, meshcat, model, station, arm, lcs, lcs_of, estimator)
+    _connect_models(rig)
 
-    connect = partial(wiring.connect, builder)
-    no_force = builder.AddNamedSystem("no_force", ConstantVectorSource(np.zeros(3)))
-    for one in lcs.values():
-        connect(estimator, "x", one, "x")
-        builder.Connect(no_force.get_output_port(), one.GetInputPort("u"))
-    # Where C3 and the arm's reference have their models from.
-    lcs_port = {name: one.GetOutputPort("lcs") for name, one in lcs.items()}
-    if meshcat is not None and not samples:  # The sampler has a model of its own.
-        sliders = builder.AddNamedSystem(
-            "model_sliders",
-            ModelSliders(lcs_of["plan"].n_pairs * [config.planner.friction], meshcat),
-        )
-        for one in lcs.values():
-            connect(sliders, "friction", one, "friction")
-            connect(sliders, "gap", one, "gap")
-    if learner_kind in ("r_dyn", "both"):
-        lcs_port |= _add_dynamics_residual(builder, lcs, lcs_of, estimator)
-    if items:
-        learner = ParameterLearner(
-            make_tip_and_ball(model)[0],
-            parameter_learner_config(
-                config, _pairs(config.planner.friction, ContactPair().tangent), items
-            ),
-            LEARN,
-            OFFSET["learner"],
-        )
-        r_comp = add_parameter_learner(
-            builder, learner, estimator, "window_valid", [lcs["plan"], lcs["command"]],
-            N_TIP, LEARN,
-        )  # fmt: skip
-        builder.Connect(
-            add_gap_std(builder, learner, LEARN), task.GetInputPort("r_std")
-        )
-    elif learner_kind in ("r_comp", "both"):
-        r_comp = _add_learner(builder, config, lcs, lcs_of, estimator, task)
-        if meshcat is not None:
-            button = builder.AddNamedSystem("adapt_button", AdaptButton(n_lam, meshcat))
-            builder.Connect(r_comp, button.get_input_port())
-            r_comp = button.get_output_port()
+    learned = _LEARNERS[_learner(config)](rig)
+    gap = rig.mean_of_tip("learned_gap", learned.r_comp, LEARN)
+    if config.contact_sequence == "sampled":
+        touches = _add_sampled(rig, learned, gap)
     else:
-        zero = builder.AddNamedSystem(
-            "no_residual", ConstantVectorSource(np.zeros(n_lam))
-        )
-        r_comp = zero.get_output_port()
-    gap = _mean_of_tip(builder, "learned_gap", r_comp, n_lam, LEARN)
-    if samples:
-        for system in (contacts.sampler, contacts.target):
-            builder.Connect(r_comp, system.GetInputPort("r_comp"))
-        nearer = _mean_of_tip(builder, "learned_reach", r_comp, n_lam, -LEARN)
-        builder.Connect(nearer, task.GetInputPort("nearer"))
-        if builder.HasSubsystemNamed("ball_tracker"):
-            # Beside the ball the gap is what its radius is too large by.
-            tracker = builder.GetSubsystemByName("ball_tracker")
-            builder.Connect(gap, tracker.GetInputPort("radius_error"))
-    else:
-        connect(estimator, "x", task, "x")
-        connect(estimator, "valid", task, "valid")
-        connect(estimator, "tip_force", task, "tip_force")
-        builder.Connect(r_comp, task.GetInputPort("r_comp"))
-    connect(estimator, "x", c3, "x")
-    connect(target, "x_desired", c3, "x_desired")
-    if wrong is not None:
-        example = lcs_of["plan"].at_default()
-        lcs_port["plan"] = faulty_lcs(builder, lcs_port["plan"], example, wrong.faults)
-    builder.Connect(lcs_port["plan"], c3.GetInputPort("lcs"))
-    builder.Connect(lcs_port["command"], c3.GetInputPort("lcs_command"))
-    builder.Connect(r_comp, c3.GetInputPort("r_comp"))
-    connect(task, "phase", reference, "phase")
-    connect(c3, "x_next", reference, "x_next")
-    connect(c3, "lam", reference, "lam")
-    connect(c3, "status", reference, "status")
-    connect(lcs["command"], "lcs", reference, "lcs")
-    if not samples:
-        connect(task, "feel", reference, "feel")
-    connect(station, f"{ARM}.position_measured", impedance, "q")
-    connect(station, f"{ARM}.velocity_measured", impedance, "v")
-    if station.HasOutputPort(DELAY):
-        connect(station, DELAY, impedance, "delay")
-    connect(impedance, "tau", station, f"{ARM}.torque_commanded")
+        touches = _add_cycle(rig, learned, follow_hard)
+    c3 = rig.add("c3_mpc", C3Mpc(touches.c3, CONTROL, OFFSET["c3"]))
+    reference = _add_reference(rig, touches.reference)
+    impedance = _add_arm(rig, control_laws(scene, arm), hybrid)
 
-    for i in range(station.num_input_ports()):
-        port = station.get_input_port(i)
-        if port.get_name() not in (f"{ARM}.torque_commanded", "overhead.region"):
-            builder.ExportInput(port, port.get_name())
+    rig.connect(estimator, "x", c3, "x")
+    rig.connect(touches.target, "x_desired", c3, "x_desired")
+    for name, port in _models_of_c3(rig).items():
+        rig.feed(port, c3, name)
+    rig.feed(learned.r_comp, c3, "r_comp")
+    rig.connect(c3, "x_next", reference, "x_next")
+    rig.connect(c3, "lam", reference, "lam")
+    rig.connect(c3, "status", reference, "status")
+    rig.connect(touches.task, "phase", reference, "phase")
+    if touches.task.HasOutputPort("feel"):
+        rig.connect(touches.task, "feel", reference, "feel")
+    rig.connect(lcs["command"], "lcs", reference, "lcs")
 
-    _add_records(builder, station, impedance, estimator)
+    _export_inputs(rig)
+    _add_records(rig, impedance)
     if meshcat is not None:
-        _add_view(builder, config, model, meshcat, station, estimator, gap, task)
+        _add_view(rig, meshcat, gap, touches.task)
 
 
-def _check_sampled(
-    config: BallRollingConfig, projection: str, learner_kind: str
-) -> None:
+def _check(config: BallRollingConfig) -> None:
+    """Raises: ValueError for settings that go without effect, or not together."""
+    check_own(config, _OWN)
+    if config.contact_sequence == "sampled":
+        _check_sampled(config)
+    _refuse_unused(config)
+
+
+def _learner(config: BallRollingConfig) -> str:
+    return config.learner if config.adapt else "none"
+
+
+def _projection(config: BallRollingConfig) -> str:
+    if config.projection != "auto":
+        return config.projection
+    return "qp" if config.controller == "paper" else "plus"
+
+
+def _check_sampled(config: BallRollingConfig) -> None:
     """Raises: ValueError for what sampled contacts do not go with."""
     check_contacts(config.contacts)
     for name, value, expected in (
         ("controller", config.controller, ("ours",)),
-        ("projection", projection, ("plus",)),
-        ("learner", learner_kind, ("none", "r_comp")),
+        ("projection", _projection(config), ("plus",)),
+        ("learner", _learner(config), ("none", "r_comp")),
     ):
         if value not in expected:
             raise ValueError(
@@ -397,13 +362,13 @@ def _refuse_unused(config: BallRollingConfig) -> None:
         refuse_unused(config, plain, name, why)
     if config.controller == "paper":
         refuse_unused(config, plain, "learning", "not used with controller=paper")
-    if not (config.adapt and config.learner == "parameters"):
+    if _learner(config) != "parameters":
         why = "used with learner=parameters alone"
         refuse_unused(config, plain, "parameters", why)
 
 
 def _add_models(
-    builder: DiagramBuilder, config: BallRollingConfig, model, items
+    builder: DiagramBuilder, config: BallRollingConfig, model: TipAndBall
 ) -> tuple[dict[str, LeafSystem], dict[str, AnitescuLcs]]:
     """The three LCS: as systems, and what they build with."""
     friction, tangent = config.planner.friction, ContactPair().tangent
@@ -411,6 +376,7 @@ def _add_models(
         # Edges along the vertical do not jump as the normal goes around the ball.
         friction, tangent = config.contacts.planner.friction, [0.0, 0.0, 1.0]
     pairs = _pairs(friction, tangent)
+    items = learned_parameters(config)
     planned = [item for item in items if item.kind != "gap"]
     lcs, lcs_of = {}, {}
     for name, dt, period in (
@@ -436,21 +402,10 @@ def _pairs(friction: float, tangent) -> list[ContactPair]:
     ]
 
 
-def _mean_of_tip(
-    builder: DiagramBuilder, name: str, r_comp: OutputPort, n_lam: int, scale: float
-) -> OutputPort:
-    """(1,) scale times the mean of the entries of r_comp for tip and ball."""
-    mean = np.zeros((1, n_lam))
-    mean[0, :N_TIP] = scale / N_TIP
-    gain = builder.AddNamedSystem(name, MatrixGain(mean))
-    builder.Connect(r_comp, gain.get_input_port())
-    return gain.get_output_port()
-
-
 def _add_sensing(
     builder: DiagramBuilder,
     config: BallRollingConfig,
-    model,
+    model: TipAndBall,
     station: Diagram,
     arm: MultibodyPlant,
 ) -> StateEstimator:
@@ -503,10 +458,126 @@ def _add_sensing(
     return estimator
 
 
-def _add_cycle(
-    builder: DiagramBuilder, config: BallRollingConfig, model, n_lam: int, p_tip
-) -> RollingTask:
-    return builder.AddNamedSystem(
+def _connect_models(rig: _Rig) -> None:
+    """What the LCS are linearised about, and where users can change them."""
+    no_force = rig.add("no_force", ConstantVectorSource(np.zeros(3)))
+    for lcs in rig.lcs.values():
+        rig.connect(rig.estimator, "x", lcs, "x")
+        rig.feed(no_force.get_output_port(), lcs, "u")
+    # The sampler has a model of its own.
+    if rig.meshcat is None or rig.config.contact_sequence == "sampled":
+        return
+    friction = rig.lcs_of["plan"].n_pairs * [rig.config.planner.friction]
+    sliders = rig.add("model_sliders", ModelSliders(friction, rig.meshcat))
+    for lcs in rig.lcs.values():
+        rig.connect(sliders, "friction", lcs, "friction")
+        rig.connect(sliders, "gap", lcs, "gap")
+
+
+def _models_of_c3(rig: _Rig) -> dict[str, OutputPort]:
+    """The LCS that C3 plans with, by its ports."""
+    names = {"lcs": "plan", "lcs_command": "command"}
+    ports = {port: rig.lcs[name].GetOutputPort("lcs") for port, name in names.items()}
+    if _learner(rig.config) in ("r_dyn", "both"):
+        r_dyn = _add_dynamics_learner(rig)
+        for port, name in names.items():
+            added = rig.add(
+                f"dynamics_residual_{name}",
+                DynamicsResidual(rig.lcs_of[name].at_default(), LEARN),
+            )
+            rig.feed(ports[port], added, "lcs")
+            rig.feed(r_dyn, added, "r_dyn")
+            ports[port] = added.get_output_port()
+    wrong = what_goes_wrong(rig.config)
+    if wrong is not None:
+        example = rig.lcs_of["plan"].at_default()
+        ports["lcs"] = faulty_lcs(rig.builder, ports["lcs"], example, wrong.faults)
+    return ports
+
+
+def _add_dynamics_learner(rig: _Rig) -> OutputPort:
+    """Returns: the residual r_dyn of the dynamics."""
+    learner = rig.add(
+        "dynamics_residual_learner",
+        DynamicsResidualLearner(
+            DynamicsResidualLearnerConfig(),
+            rig.lcs_of["learn"].at_default(),
+            LEARN,
+            OFFSET["learner"],
+        ),
+    )
+    rig.connect(rig.estimator, "x", learner, "x")
+    rig.connect(rig.estimator, "u_measured", learner, "u_measured")
+    rig.connect(rig.lcs["learn"], "lcs", learner, "lcs")
+    return learner.GetOutputPort("r_dyn")
+
+
+def _learn_nothing(rig: _Rig) -> _Learned:
+    zero = rig.add("no_residual", ConstantVectorSource(np.zeros(rig.n_lam)))
+    return _Learned(zero.get_output_port())
+
+
+def _learn_residual(rig: _Rig) -> _Learned:
+    """The residual of the contact; sampled contacts get it less an allowance."""
+    config = rig.config
+    samples = config.contact_sequence == "sampled"
+    if config.controller == "paper":
+        settings = paper_learner_config(rig.n_lam)
+    else:
+        settings = learner_config(config.learning, config.contacts if samples else None)
+    example = rig.lcs_of["learn"].at_default()
+    learner = rig.add(
+        "residual_learner", ResidualLearner(settings, example, LEARN, OFFSET["learner"])
+    )
+    rig.connect(rig.estimator, "x", learner, "x")
+    rig.connect(rig.estimator, "u_measured", learner, "u_measured")
+    rig.connect(rig.estimator, "window_valid", learner, "enable")
+    rig.connect(rig.lcs["learn"], "lcs", learner, "lcs")
+    r_comp = learner.GetOutputPort("r_comp")
+    if samples:
+        taken = np.zeros(rig.n_lam)
+        taken[:N_TIP] = -config.contacts.gap_allowance / LEARN
+        allowance = rig.add("gap_allowance", ConstantVectorSource(taken))
+        cautious = rig.add("cautious_residual", Adder(2, rig.n_lam))
+        rig.builder.Connect(r_comp, cautious.get_input_port(0))
+        rig.builder.Connect(allowance.get_output_port(), cautious.get_input_port(1))
+        r_comp = cautious.get_output_port()
+    if rig.meshcat is not None:
+        button = rig.add("adapt_button", AdaptButton(rig.n_lam, rig.meshcat))
+        rig.builder.Connect(r_comp, button.get_input_port())
+        r_comp = button.get_output_port()
+    return _Learned(r_comp, learner.GetOutputPort("r_std"))
+
+
+def _learn_parameters(rig: _Rig) -> _Learned:
+    """Mass, frictions and gap, where the plan is made with them."""
+    pairs = _pairs(rig.config.planner.friction, ContactPair().tangent)
+    settings = parameter_learner_config(
+        rig.config, pairs, learned_parameters(rig.config)
+    )
+    model = make_tip_and_ball(rig.model)[0]
+    learner = ParameterLearner(model, settings, LEARN, OFFSET["learner"])
+    users = [rig.lcs["plan"], rig.lcs["command"]]
+    r_comp = add_parameter_learner(
+        rig.builder, learner, rig.estimator, "window_valid", users, N_TIP, LEARN
+    )
+    return _Learned(r_comp, add_gap_std(rig.builder, learner, LEARN))
+
+
+# By `learner`; what learns r_dyn is beside them, _models_of_c3.
+_LEARNERS = {
+    "none": _learn_nothing,
+    "r_dyn": _learn_nothing,
+    "r_comp": _learn_residual,
+    "both": _learn_residual,
+    "parameters": _learn_parameters,
+}
+
+
+def _add_cycle(rig: _Rig, learned: _Learned, follow_hard: bool) -> _Touches:
+    """Touches as written by hand: from above, push after push along the circle."""
+    config, model = rig.config, rig.model
+    task = rig.add(
         "rolling_task",
         RollingTask(
             replace(config.task, period_sec=CONTROL, offset_sec=OFFSET["task"]),
@@ -514,79 +585,95 @@ def _add_cycle(
             knot_sec=PLAN_DT,
             radius_ball=model.ball_radius,
             radius_tip=model.tip_radius,
-            n_lam=n_lam,
+            n_lam=rig.n_lam,
             n_tip=N_TIP,
             residual_dt_sec=LEARN,
-            p_tip=p_tip,
+            p_tip=rig.p_tip,
         ),
+    )
+    rig.connect(rig.estimator, "x", task, "x")
+    rig.connect(rig.estimator, "valid", task, "valid")
+    rig.connect(rig.estimator, "tip_force", task, "tip_force")
+    rig.feed(learned.r_comp, task, "r_comp")
+    if learned.r_std is not None:
+        rig.feed(learned.r_std, task, "r_std")
+    return _Touches(
+        task,
+        task,
+        c3_config(config.planner, rig.n_lam, _projection(config)),
+        ArmReferenceConfig(follow=FollowConfig(hard=follow_hard)),
     )
 
 
-def _add_dynamics_residual(
-    builder: DiagramBuilder, lcs, lcs_of, estimator: StateEstimator
-) -> dict[str, OutputPort]:
-    """A learner of the dynamics' residual. Returns: the LCS that have it."""
-    r_dyn = builder.AddNamedSystem(
-        "dynamics_residual_learner",
-        DynamicsResidualLearner(
-            DynamicsResidualLearnerConfig(),
-            lcs_of["learn"].at_default(),
-            LEARN,
-            OFFSET["learner"],
-        ),
+def _add_sampled(rig: _Rig, learned: _Learned, gap: OutputPort) -> _Touches:
+    """Touches from the side, where C3 finds the least cost of those that it samples."""
+    config, contacts = rig.config, rig.config.contacts
+    c3 = sampled_c3_config(
+        contacts.planner, rig.n_lam, N_TIP, rig.model.ball_radius, LEARN
     )
-    for name in ("x", "u_measured"):
-        wiring.connect(builder, estimator, name, r_dyn, name)
-    wiring.connect(builder, lcs["learn"], "lcs", r_dyn, "lcs")
-    ports = {}
-    for name in ("plan", "command"):
-        added = builder.AddNamedSystem(
-            f"dynamics_residual_{name}",
-            DynamicsResidual(lcs_of[name].at_default(), LEARN),
-        )
-        wiring.connect(builder, lcs[name], "lcs", added, "lcs")
-        wiring.connect(builder, r_dyn, "r_dyn", added, "r_dyn")
-        ports[name] = added.get_output_port()
-    return ports
+    added = add_sampled_contacts(
+        rig.builder,
+        contacts,
+        PathTargetConfig(center=config.task.center, radius=config.task.radius),
+        rig.model,
+        rig.lcs_of["plan"],
+        c3,
+        rig.p_tip,
+        N_TIP,
+        CONTROL,
+        OFFSET,
+        rig.estimator,
+    )
+    rig.feed(learned.r_comp, added.sampler, "r_comp")
+    rig.feed(learned.r_comp, added.target, "r_comp")
+    nearer = rig.mean_of_tip("learned_reach", learned.r_comp, -LEARN)
+    rig.feed(nearer, added.task, "nearer")
+    if rig.builder.HasSubsystemNamed("ball_tracker"):
+        # Beside the ball the gap is what its radius is too large by.
+        tracker = rig.builder.GetSubsystemByName("ball_tracker")
+        rig.feed(gap, tracker, "radius_error")
+    height = contacts.sampler.sampling.height
+    return _Touches(
+        added.task, added.target, c3, replace(contacts.reference, height=height)
+    )
 
 
-def _add_learner(
-    builder: DiagramBuilder,
-    config: BallRollingConfig,
-    lcs,
-    lcs_of,
-    estimator: StateEstimator,
-    task: LeafSystem,
-) -> OutputPort:
-    """The learner of the contact's residual. Returns: what controllers get of it."""
-    n_lam = lcs_of["plan"].n_lam
-    samples = config.contact_sequence == "sampled"
-    if config.controller == "paper":
-        settings = paper_learner_config(n_lam)
-    else:
-        settings = learner_config(config.learning, config.contacts if samples else None)
-    learner = builder.AddNamedSystem(
-        "residual_learner",
-        ResidualLearner(
-            settings, lcs_of["learn"].at_default(), LEARN, OFFSET["learner"]
-        ),
+def _add_reference(rig: _Rig, settings: ArmReferenceConfig) -> ArmReference:
+    settings = replace(
+        settings,
+        tip_mass=rig.model.tip_mass,
+        period_sec=CONTROL,
+        offset_sec=OFFSET["reference"],
     )
-    for name, port in (
-        ("x", "x"), ("u_measured", "u_measured"), ("window_valid", "enable"),
-    ):  # fmt: skip
-        wiring.connect(builder, estimator, name, learner, port)
-    wiring.connect(builder, lcs["learn"], "lcs", learner, "lcs")
-    r_comp = learner.GetOutputPort("r_comp")
-    if not samples:
-        wiring.connect(builder, learner, "r_std", task, "r_std")
-        return r_comp
-    taken = np.zeros(n_lam)
-    taken[:N_TIP] = -config.contacts.gap_allowance / LEARN
-    allowance = builder.AddNamedSystem("gap_allowance", ConstantVectorSource(taken))
-    cautious = builder.AddNamedSystem("cautious_residual", Adder(2, n_lam))
-    builder.Connect(r_comp, cautious.get_input_port(0))
-    builder.Connect(allowance.get_output_port(), cautious.get_input_port(1))
-    return cautious.get_output_port()
+    example = rig.lcs_of["command"].at_default()
+    return rig.add(
+        "arm_reference", ArmReference(settings, rig.n_lam, rig.p_tip, example)
+    )
+
+
+def _add_arm(rig: _Rig, laws, hybrid: HybridConfig | None) -> ImpedanceController:
+    """The arm's controller, and its connections to the station."""
+    settings = replace(
+        rig.config.impedance, period_sec=ARM_TICK, offset_sec=OFFSET["impedance"]
+    )
+    impedance = rig.add(
+        "impedance_controller",
+        ImpedanceController(settings, rig.arm, TIP_FRAME, hybrid=hybrid, laws=laws),
+    )
+    rig.connect(rig.station, f"{ARM}.position_measured", impedance, "q")
+    rig.connect(rig.station, f"{ARM}.velocity_measured", impedance, "v")
+    if rig.station.HasOutputPort(DELAY):
+        rig.connect(rig.station, DELAY, impedance, "delay")
+    rig.connect(impedance, "tau", rig.station, f"{ARM}.torque_commanded")
+    return impedance
+
+
+def _export_inputs(rig: _Rig) -> None:
+    """What nothing here gives the station."""
+    for i in range(rig.station.num_input_ports()):
+        port = rig.station.get_input_port(i)
+        if port.get_name() not in (f"{ARM}.torque_commanded", "overhead.region"):
+            rig.builder.ExportInput(port, port.get_name())
 
 
 def _is_simulated(station: Diagram) -> bool:
@@ -594,64 +681,50 @@ def _is_simulated(station: Diagram) -> bool:
     return station.HasSubsystemNamed("plant")
 
 
-def _add_records(
-    builder: DiagramBuilder,
-    station: Diagram,
-    impedance: ImpedanceController,
-    estimator: StateEstimator,
-) -> None:
+def _add_records(rig: _Rig, impedance: ImpedanceController) -> None:
     """What is scored, and what a recording has."""
     tau = impedance.GetOutputPort("tau")
     logged = {"torque_log": tau}
-    if _is_simulated(station):
-        logged["state_log"] = station.GetOutputPort("state")
-        logged["contact_log"] = station.GetOutputPort(f"{ARM}.contact_torque")
+    if _is_simulated(rig.station):
+        logged["state_log"] = rig.station.GetOutputPort("state")
+        logged["contact_log"] = rig.station.GetOutputPort(f"{ARM}.contact_torque")
     for name, source in logged.items():
-        LogVectorOutput(source, builder, ARM_TICK).set_name(name)
+        LogVectorOutput(source, rig.builder, ARM_TICK).set_name(name)
     # The ball's height is no measurement: the tracker takes the model's radius for it.
     of_ball = [""] * N_X
     of_ball[P_BALL.start : P_BALL.start + 2] = BALL_CHANNELS
-    seen = {"ball": (estimator.GetOutputPort("x"), of_ball)}
-    record_station(builder, station, tau, TOOL, CONTROL, seen)
+    seen = {"ball": (rig.estimator.GetOutputPort("x"), of_ball)}
+    record_station(rig.builder, rig.station, tau, TOOL, CONTROL, seen)
 
 
-def _add_view(
-    builder: DiagramBuilder,
-    config: BallRollingConfig,
-    model,
-    meshcat: Meshcat,
-    station: Diagram,
-    estimator: StateEstimator,
-    gap: OutputPort,
-    task: LeafSystem,
-) -> None:
-    view = builder.AddNamedSystem(
+def _add_view(rig: _Rig, meshcat: Meshcat, gap: OutputPort, task: LeafSystem) -> None:
+    view = rig.add(
         "rolling_view",
         RollingView(
             RollingViewConfig(
-                center=config.task.center,
-                radius=config.task.radius,
-                ball_radius=model.ball_radius,
+                center=rig.config.task.center,
+                radius=rig.config.task.radius,
+                ball_radius=rig.model.ball_radius,
             ),
             meshcat,
         ),
     )
-    x = estimator.GetOutputPort("x")
-    if _is_simulated(station):
-        plant = station.GetSubsystemByName("plant")
-        state, size = station.GetOutputPort("state"), plant.num_multibody_states()
+    x = rig.estimator.GetOutputPort("x")
+    if _is_simulated(rig.station):
+        plant = rig.station.GetSubsystemByName("plant")
+        state, size = rig.station.GetOutputPort("state"), plant.num_multibody_states()
         at = plant.GetBodyByName("ball").floating_positions_start() + 4
     else:  # As it is estimated.
         state, size, at = x, N_X, P_BALL.start
     select = np.zeros((3, size))
     select[:, at : at + 3] = np.eye(3)
-    p_ball = builder.AddNamedSystem("true_ball", MatrixGain(select))
-    builder.Connect(state, p_ball.get_input_port())
-    builder.Connect(p_ball.get_output_port(), view.GetInputPort("p_ball"))
-    builder.Connect(x, view.GetInputPort("x"))
-    builder.Connect(gap, view.GetInputPort("gap"))
+    p_ball = rig.add("true_ball", MatrixGain(select))
+    rig.builder.Connect(state, p_ball.get_input_port())
+    rig.feed(p_ball.get_output_port(), view, "p_ball")
+    rig.feed(x, view, "x")
+    rig.feed(gap, view, "gap")
     legend = LegendConfig(view.legend, PHASES, view.CAMERA, view.LOOK_AT)
-    add_legend(builder, meshcat, legend, task.GetOutputPort("phase"))
+    add_legend(rig.builder, meshcat, legend, task.GetOutputPort("phase"))
 
 
 def task_name(diagram: Diagram | DiagramBuilder) -> str:
