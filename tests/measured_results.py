@@ -1,4 +1,4 @@
-"""Runs `makebreak gap` on all measured data: the tables of docs/results.md.
+"""Runs `makebreak gap` on all measured data: the tables of docs/lab/results.md.
 
     python tests/measured_results.py DATA_FOLDER OUT [--only NAME ...] [--write FILE]
 
@@ -45,7 +45,7 @@ class Row:
 @dataclass(frozen=True, eq=False)
 class Found:
     """Results of one set: rows of the common table, gap's result.json, and the set's
-    own tables by their names in docs/results.md."""
+    own tables by their names in docs/lab/results.md."""
 
     rows: list[Row]
     result: dict
@@ -287,7 +287,8 @@ def main() -> int:
     parser.add_argument("data", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--only", nargs="+", choices=list(SETS), default=list(SETS))
-    parser.add_argument("--write", type=Path, metavar="FILE", help="docs/results.md")
+    page = "docs/lab/results.md"
+    parser.add_argument("--write", type=Path, metavar="FILE", help=page)
     args = parser.parse_args()
     found = {}
     for name in args.only:

@@ -140,3 +140,39 @@ def test_a_scene_is_read_and_loaded(tmp_path, monkeypatch):
 
 def test_stations_are_made():
     assert ran("station.md", 0)["station"].num_input_ports() > 0
+
+
+# A user's page says what holds now; which runs showed it, on which seeds and with which
+# code, is the lab book's. Commands that a page shows have seeds, of course.
+OF_THE_LAB = (
+    r"seeds? (?:\d|S\b)|(?:unseen|fresh) (?:seed|run)|\b(?:tuned|developed) on\b"
+    r"|\bcommit [0-9a-f]{7}|(?:older|earlier) (?:version|code)|\| seed \|"
+)
+USER_PAGES = [
+    DOCS.parent / "README.md",
+    *(p for p in DOCS.glob("*.md") if p.name not in ("changelog.md",)),
+    *(DOCS / "tutorials").glob("*.py"),
+]
+
+
+def of_the_lab(text):
+    """What a page says in words, in front of a reader, that is for the lab book."""
+    text = re.sub(
+        r"^```[\s\S]*?^```|^    .*$|`[^`\n]*`|\]\([^)]*\)", "", text, flags=re.M
+    )
+    return re.findall(OF_THE_LAB, text, re.IGNORECASE)
+
+
+@pytest.mark.parametrize("page", USER_PAGES, ids=lambda page: page.name)
+def test_pages_for_users_say_what_holds_and_not_on_which_seeds(page):
+    assert of_the_lab(page.read_text()) == []
+
+
+def test_the_lab_book_has_the_seeds():
+    """The words above are those of such texts."""
+    for page in ("ball_rolling", "cube_pivoting", "planar", "shaping", "wall_friction"):
+        assert of_the_lab((DOCS / "lab" / f"{page}_measured.md").read_text()), page
+    shown = (
+        "    makebreak run cube_pivoting --seed 0\n`--seed 3`: a seed draws the start"
+    )
+    assert of_the_lab(shown) == []

@@ -16,7 +16,7 @@ from measured_results import (
 
 from makebreak.scripts.runner.table import Table
 
-PAGE = Path(__file__).parent.parent / "docs/results.md"
+PAGE = Path(__file__).parent.parent / "docs/lab/results.md"
 
 
 def test_a_row_says_before_after_goal_and_what_was_named():

@@ -73,22 +73,24 @@ def test_the_seven_systems_are_where_the_table_says():
 
 N = r"([\d.]+)"
 LAB = "docs/lab/experiments.md"
+PLANAR = "docs/lab/planar_measured.md"
+SHAPING = "docs/lab/shaping_measured.md"
 # A result that stands on several pages: {page: where its figures are there}.
 SAME_FIGURES = {
     "extra time for contact handling": {
         "README.md": rf"extra time.*\*\*{N} to {N} s\*\*; \[{N} to {N} s\]",
         LAB: rf"extra time.*\*\*{N} to {N} s\*\*; \[{N} to {N} s\]",
-        "docs/shaping.md": rf"\| extra time \| 3.7 s \| [\d.]+ \({N} - {N}\)[\s\S]*?"
+        SHAPING: rf"\| extra time \| 3.7 s \| [\d.]+ \({N} - {N}\)[\s\S]*?"
         rf"\| the least that force and acceleration allow \| \| [\d.]+ \({N} - {N}\)",
     },
     "impacts of four contacts": {
         "README.md": rf"four unknown contacts.*\| {N} N; \*\*{N} N\*\* \|",
         LAB: rf"four contacts.*\| {N} N; \*\*{N} N\*\*",
-        "docs/shaping.md": rf"first trial: imp.*?\| {N} \([\d.]+ - {N}\) N; at most",
+        SHAPING: rf"first trial: imp.*?\| {N} \([\d.]+ - {N}\) N; at most",
     },
     "impacts of at most 10 N": {
         LAB: r"four contacts.*at most 10 N in (\d+) of (\d+)",
-        "docs/shaping.md": r"first trial: impact.* N; at most 10 N in (\d+) of (\d+)",
+        SHAPING: r"first trial: impact.* N; at most 10 N in (\d+) of (\d+)",
     },
     "position error after five trials": {
         LAB: rf"contacts after five trials \|.*?\| {N} mm, perfect",
@@ -97,18 +99,18 @@ SAME_FIGURES = {
     },
     "porridge: fixed, incremental, no model": {
         LAB: rf"porridge, prediction.*\| {N}; {N}; {N} N \|",
-        "docs/planar.md": rf"fixed mixture \(EM.*?\| {N} [\s\S]*?\| incremental \| {N} "
+        PLANAR: rf"fixed mixture \(EM.*?\| {N} [\s\S]*?\| incremental \| {N} "
         rf"[\s\S]*?no model: the last measured force \| {N} ",
     },
     "springs: ours, MRAC": {
         "README.md": rf"circle on springs.*\*\*{N} mm\*\*; {N} mm",
         LAB: rf"circle on springs.*\*\*{N}\*\*; {N}; ",
-        "docs/planar.md": rf"\| adaptive \(ours\), trial 1 \| .*? \| {N} \([\s\S]*?"
+        PLANAR: rf"\| adaptive \(ours\), trial 1 \| .*? \| {N} \([\s\S]*?"
         rf"\| MRAC \+ force, trial 1 \| .*? \| {N} \(",
     },
     "springs: active inference, biomimetic": {
         LAB: rf"circle on springs.*\*\*; [\d.]+; {N}; {N} mm",
-        "docs/planar.md": rf"\| active inference \+ force, trial 1 \| .*? \| {N} \("
+        PLANAR: rf"\| active inference \+ force, trial 1 \| .*? \| {N} \("
         rf"[\s\S]*?\| biomimetic \+ force, trial 1 \| .*? \| {N} \(",
     },
 }

@@ -101,7 +101,7 @@ def test_what_is_named_on_five_motions_halves_the_error_on_the_others(arm):
         return np.sqrt(np.mean([of[channel] ** 2 for channel in arm_joints]))
 
     # Half without the gripper, whose error in these motions is not known to be of any
-    # effect; docs/results.md.
+    # effect; docs/lab/results.md.
     assert rms(repaired) < 0.5 * rms(came)
     assert repaired["all positions"] < 0.7 * came["all positions"]
     # Which friction it is these data hardly tell; that the drive is stiffer they do.

@@ -42,7 +42,7 @@ STALL, FREE, DUTY, GAIN, VOLTAGE, ROTOR = 2.94, 4.7, 0.97, 0.166 * 16, 12.0, 0.0
 PUBLISHED = {"kp": 17.8, "damping": 0.60, "coulomb": 0.052, "rotor": 0.028}
 
 # Six numbers for all joints, by one Gauss-Newton step on 50 simulated windows of 0.5 s
-# of the motions for fitting; docs/results.md.
+# of the motions for fitting; docs/lab/results.md.
 BY_HAND = (
     ("servo_gain", "kp", 13.46),
     ("joint_load_friction", "share", 0.817),
