@@ -185,9 +185,10 @@ def _run(
     seconds: dict[str, float] = {}
     scene = read_scene(scene_path)
     go_on()
-    recordings = read_recordings(recording_paths, skip_bad_rows, sidecars)
-    recordings = in_newton_metres(recordings, scene.channels)
     dynamics = SceneDynamics(scene)
+    slides = sliding_joints(dynamics.plant)
+    recordings = read_recordings(recording_paths, skip_bad_rows, sidecars, slides)
+    recordings = in_newton_metres(recordings, scene.channels)
     joints, bodies = scene_names(dynamics.plant)
     for recording in recordings:
         check_against_scene(recording, joints, bodies)

@@ -32,13 +32,15 @@ class FileDrive:
 class PlainMjcf:
     """text: MJCF for Drake. effects: of joints, by their names in the file, that Drake
     keeps no place for. drives, home: {joint: ...}, home of the first keyframe (or the
-    joint's reference). notes: what is left out, and what that means. left_out: number
+    joint's reference). passive: joints that nothing drives, where actuators drive
+    others alone. notes: what is left out, and what that means. left_out: number
     of collision meshes that are not there."""
 
     text: str
     effects: tuple[Effect, ...] = ()
     drives: dict[str, FileDrive] = field(default_factory=dict)
     home: dict[str, float] = field(default_factory=dict)
+    passive: tuple[str, ...] = ()
     gravity: tuple[float, ...] = (0.0, 0.0, -9.81)
     notes: tuple[str, ...] = ()
     left_out: int = 0
@@ -180,13 +182,13 @@ class _Writer:
             places[body] = self._body(body, places[m.body_parentid[body]])
         self._contact(root)
         self._equality(root)
-        drives = self._actuators(root)
+        drives, passive = self._actuators(root)
         self._left_out()
         ET.indent(root)
         return PlainMjcf(
             ET.tostring(root, encoding="unicode") + "\n", tuple(self.effects), drives,
-            self._home(), tuple(float(x) for x in m.opt.gravity), tuple(self.notes),
-            self.left_out,
+            self._home(), passive, tuple(float(x) for x in m.opt.gravity),
+            tuple(self.notes), self.left_out,
         )  # fmt: skip
 
     def _name(self, kind: str, index: int) -> str:
@@ -388,13 +390,15 @@ class _Writer:
                 "left out, so the force in a loop that it closes is missing"
             )
 
-    def _actuators(self, root: ET.Element) -> dict[str, FileDrive]:
-        """One motor for each joint that has some, and the drives as MuJoCo has them."""
+    def _actuators(self, root: ET.Element):
+        """One motor for each joint that has some. Returns: the drives as MuJoCo has
+        them, {joint: FileDrive}, and joints without one, if all are of joints."""
         m = self.m
         drives: dict[str, FileDrive] = {}
-        lost = []
+        lost, elsewhere = [], False
         for a in range(len(m.actuator_trntype)):
             j = self._driven(a)
+            elsewhere |= j is None
             if j is not None:
                 drive = self._drive(a, j)
                 name = self._name("joint", j)
@@ -423,7 +427,10 @@ class _Writer:
                 attributes["ctrllimited"] = "true"
                 attributes["ctrlrange"] = _numbers([-drive.limit, drive.limit])
             ET.SubElement(motors, "motor", attributes)
-        return drives
+        joints = [self._name("joint", j) for j in range(m.njnt) if m.jnt_type[j] >= 2]
+        return drives, tuple(
+            name for name in joints if drives and not elsewhere and name not in drives
+        )
 
     def _drive(self, a: int, j: int) -> FileDrive | None:
         """force = gain ctrl + b0 + b1 length + b2 velocity, and the joint's effort is

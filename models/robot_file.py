@@ -40,7 +40,9 @@ _UNUSED = {
 @dataclass(frozen=True, eq=False)
 class RobotFile:
     """text: as Drake reads it, with the suffix. effects: of joints, by their names in
-    the file. drives, home: of joints, {} where the file does not say them. notes: what
+    the file. drives, home: of joints, {} where the file does not say them. limits: of
+    joints' efforts [N m] or [N]. passive: joints that the file gives no drive, where it
+    gives others one. notes: what
     nobody uses, and what that means. lost: {collision mesh that is not there, or cannot
     be read: where it should be, or None: its package is unknown}; lost_visuals: of
     meshes for display. left_out: collision shapes that text lacks."""
@@ -51,6 +53,8 @@ class RobotFile:
     effects: tuple[Effect, ...] = ()
     drives: Mapping[str, FileDrive] = field(default_factory=dict)
     home: Mapping[str, float] = field(default_factory=dict)
+    limits: Mapping[str, float] = field(default_factory=dict)
+    passive: tuple[str, ...] = ()
     gravity: tuple[float, ...] = (0.0, 0.0, -9.81)
     notes: tuple[str, ...] = ()
     lost: Mapping[str, Path | None] = field(default_factory=dict)
@@ -102,7 +106,8 @@ def _read(path: Path, changed: int, packages: tuple, surroundings: tuple) -> Rob
         )  # fmt: skip
         return RobotFile(
             path, named, ".xml", plain.effects, plain.drives, plain.home,
-            plain.gravity, plain.notes, left_out=plain.left_out,
+            passive=plain.passive, gravity=plain.gravity, notes=plain.notes,
+            left_out=plain.left_out,
         )  # fmt: skip
     suffix = {"robot": ".urdf", "sdf": ".sdf"}.get(root.tagName)
     if suffix is None:
@@ -160,8 +165,10 @@ def _of_document(document: Any, path: Path, suffix: str, packages) -> RobotFile:
         notes += _without_empty_limits(document)
         _clean_materials(document)
     effects, more = _of_joints(document)
+    limits, passive = _drives(document)
     return RobotFile(
-        path, document.toxml(), suffix, effects, notes=(*notes, *more),
+        path, document.toxml(), suffix, effects, limits=limits, passive=passive,
+        notes=(*notes, *more),
         lost=lost, lost_visuals=lost_visuals, visuals_left_out=visuals,
         left_out=collisions,
     )  # fmt: skip
@@ -408,6 +415,32 @@ def _clean_materials(document: minidom.Document) -> None:
         if material.getAttribute("name") not in known:
             if not children(material, "color"):
                 _remove(material)
+
+
+def _drives(document: minidom.Document) -> tuple[dict[str, float], tuple[str, ...]]:
+    """Effort limits of joints, and those that nothing drives: of which no transmission
+    is, or of a limit of 0. Where that is all of them, nobody thought of it."""
+    limits = {}
+    joints = [e for e in document.getElementsByTagName("joint")
+              if e.getAttribute("type") not in ("", "fixed")]  # fmt: skip
+    for joint in joints:
+        values = [e.getAttribute("effort") for e in children(joint, "limit")]
+        values += [text(e) for e in children(joint, "axis", "limit", "effort")]
+        try:
+            limits[joint.getAttribute("name")] = float(values[0])
+        except (IndexError, ValueError):
+            continue
+    drives = {
+        joint.getAttribute("name")
+        for transmission in document.getElementsByTagName("transmission")
+        for joint in children(transmission, "joint")
+    }
+    names = [joint.getAttribute("name") for joint in joints]
+    passive = tuple(
+        n for n in names if limits.get(n) == 0.0 or drives and n not in drives
+    )
+    limits = {name: limit for name, limit in limits.items() if limit > 0.0}
+    return limits, passive if len(passive) < len(names) else ()
 
 
 def _unused(document: minidom.Document) -> list[str]:

@@ -1101,7 +1101,8 @@ def seen(robot_path: Path, log_path: Path, log: Log) -> Seen:
         for path, text in proposal.sidecars.items():
             sidecars[path] = path.with_name("proposed.yaml")
             sidecars[path].write_text(text)
-        recordings = read_recordings([log_path], sidecars=sidecars)
+        slides = [j.name for j in robot.joints if j.prismatic]
+        recordings = read_recordings([log_path], sidecars=sidecars, slides=slides)
     except ValueError as error:
         told = str(error)
         gains = log.truth.get("gains")

@@ -7,8 +7,8 @@ import pytest
 from front_doors import KINDS, ROBOTS, exact, one
 
 from makebreak.gap.data.content import check_contents, likeness
-from makebreak.gap.data.reading import read_recording
-from makebreak.gap.data.robot import read_robot
+from makebreak.gap.data.reading import read_recording, read_recordings
+from makebreak.gap.data.robot import propose_scene, read_log, read_robot
 from makebreak.gap.data.table import write_recording
 from makebreak.gap.data.turns import without_turns
 
@@ -113,3 +113,111 @@ def test_turns_are_undone_and_fast_motion_is_left_alone():
     np.testing.assert_allclose(back, q, atol=1e-12)
     steps = 3.0 * np.arange(50.0) % 7.0
     assert without_turns(steps)[1] == 0
+
+
+def with_limits(path, limits):
+    """The URDF with these effort limits, joint by joint."""
+    parts = path.read_text().split('effort="500"')
+    text = "".join(
+        f'{part}effort="{limit}"' for part, limit in zip(parts, limits, strict=False)
+    )
+    path.write_text(text + parts[-1])
+
+
+def csv(path, columns):
+    np.savetxt(path, np.column_stack(list(columns.values())), "%.9g", ",",
+               header=",".join(columns), comments="")  # fmt: skip
+    return path
+
+
+@pytest.mark.parametrize(("part", "word"), [(0.01, "per cent"), (0.001, "per mille")])
+def test_efforts_in_parts_of_each_joints_limit_are_said_as_that(tmp_path, part, word):
+    """Also where a part is near 1, as that of 87 N m, and of joints that cannot tell
+    their unit from a rotor."""
+    path, log = exact("scara", tmp_path, np.random.default_rng(8))
+    limits = [87.0, 120.0, 40.0, 12.0]
+    with_limits(path, limits)
+    columns = {"time": log.time} | log.columns
+    for k, limit in enumerate(limits, start=1):
+        columns[f"joint{k}_effort"] = columns[f"joint{k}_effort"] / (part * limit)
+    read = read_log(csv(tmp_path / "log.csv", columns))
+    proposal = propose_scene(read_robot(path), [read])
+    assert f"{word} of each joint's effort limit" in proposal.sidecars[read.path]
+    for k, limit in enumerate(limits, start=1):
+        line = f"joint{k}_effort: {{channel: arm.joint{k}.effort_measured, scale: "
+        assert f"{line}{part * limit!r}" in proposal.sidecars[read.path]
+
+
+def test_of_one_swing_no_effort_is_taken_to_lack_the_weight(tmp_path):
+    """Weight and motion then go with the same sine: a pendulum without gravity, with
+    other efforts of the other sign, explains it as well."""
+    (tmp_path / "arm.urdf").write_text(
+        '<robot name="arm"><link name="base"/><link name="rod"><inertial><origin xyz="0'
+        ' 0 -0.2"/><mass value="1"/><inertia ixx="1e-3" iyy="1e-3" izz="1e-3" ixy="0" '
+        'ixz="0" iyz="0"/></inertial></link><joint name="j1" type="continuous"><parent '
+        'link="base"/><child link="rod"/><axis xyz="0 1 0"/></joint></robot>'
+    )
+    t = np.arange(0.0, 3.0, 0.01)
+    q = 0.5 * np.sin(3.0 * t)
+    columns = {"time": t, "j1_position": q, "j1_effort": 1.78 * q}
+    read = read_log(csv(tmp_path / "log.csv", columns))
+    proposal = propose_scene(read_robot(tmp_path / "arm.urdf"), [read])
+    assert "gravity" not in proposal.scene
+    assert "scale" not in proposal.sidecars[read.path]
+
+
+def test_a_slide_that_is_moved_by_six_metres_makes_no_turn(tmp_path):
+    q = 1.0 + np.where(np.arange(400) < 200, 0.0, 2.0 * np.pi)
+    table = {"time": 0.01 * np.arange(400.0), "arm.rail.position": q,
+             "arm.hinge.position": q}  # fmt: skip
+    write_recording(tmp_path / "log.csv", table)
+    (read,) = read_recordings([tmp_path / "log.csv"], slides=["arm.rail"])
+    assert np.ptp(read["arm.rail.position"]) == pytest.approx(2.0 * np.pi)
+    assert np.ptp(read["arm.hinge.position"]) == pytest.approx(0.0, abs=1e-9)
+
+
+PUSHED = {
+    "urdf": """<robot name="arm"><link name="base"/>{links}
+<joint name="finger" type="prismatic"><parent link="base"/><child link="f"/>
+<axis xyz="1 0 0"/><limit effort="20" lower="-2" upper="2" velocity="9"/></joint>
+<joint name="puck" type="prismatic"><parent link="base"/><child link="p"/>
+<axis xyz="1 0 0"/><limit effort="{of_puck}" lower="-2" upper="2" velocity="9"/>
+</joint></robot>""",
+    "sdf": """<sdf version="1.9"><model name="arm"><link name="base"/>{links}
+<joint name="finger" type="prismatic"><parent>base</parent><child>f</child>
+<axis><xyz>1 0 0</xyz></axis></joint>
+<joint name="puck" type="prismatic"><parent>base</parent><child>p</child>
+<axis><xyz>1 0 0</xyz><limit><effort>{of_puck}</effort></limit></axis></joint>
+</model></sdf>""",
+    "xml": """<mujoco model="arm"><worldbody>{links}</worldbody><actuator>
+<motor joint="finger"/>{of_puck}</actuator></mujoco>""",
+}
+LINK = {
+    "urdf": '<link name="{0}"><inertial><mass value="1"/><inertia ixx="1e-3" iyy="1e-3"'
+            ' izz="1e-3" ixy="0" ixz="0" iyz="0"/></inertial></link>',
+    "sdf": '<link name="{0}"><inertial><mass>1</mass></inertial></link>',
+    "xml": '<body><joint name="{1}" type="slide" axis="1 0 0"/><inertial pos="0 0 0" '
+           'mass="1" diaginertia="1e-3 1e-3 1e-3"/></body>',
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("suffix", "passive", "driven"),
+    [("urdf", "0", "20"), ("sdf", "0", "20"), ("xml", "", '<motor joint="puck"/>')],
+)
+def test_what_the_file_gives_no_drive_has_none(tmp_path, suffix, passive, driven):
+    """A puck that a finger pushes needs as much force as if it were driven itself."""
+    t = np.arange(0.0, 6.0, 0.01)
+    q = 0.3 * np.sin(2.0 * t) + 0.2 * np.sin(3.1 * t)
+    force = -2.4 * np.sin(2.0 * t) - 3.844 * np.sin(3.1 * t)
+    columns = {"time": t, "finger_position": q, "puck_position": q}
+    columns["finger_effort"] = force
+    read = read_log(csv(tmp_path / "log.csv", columns))
+    links = "".join(LINK[suffix].format(*n) for n in (("f", "finger"), ("p", "puck")))
+    for of_puck, joints in ((passive, "arm.finger"), (driven, "arm.finger, arm.puck")):
+        path = tmp_path / f"arm.{suffix}"
+        path.write_text(PUSHED[suffix].format(links=links, of_puck=of_puck))
+        proposal = propose_scene(read_robot(path), [read])
+        assert f"actuation: {{type: effort, joints: [{joints}]}}" in proposal.scene
+        said = any("nothing drives arm.puck" in note for note in proposal.notes)
+        assert said == (of_puck == passive)

@@ -73,6 +73,22 @@ def proposal_of(folder, path, names=("j1", "j2")):
     return propose_scene(read_robot(path), [read_log(folder / "log.csv")])
 
 
+def test_columns_are_judged_by_inertias_as_the_scene_has_them(tmp_path):
+    """Of a foot with moments and no mass Drake makes a ball of 1 kg."""
+    foot = (
+        '<link name="foot"><inertial><mass value="0"/><inertia ixx="5.7e-7" iyy="8e-7" '
+        'izz="5e-7" ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="ankle" '
+        'type="fixed"><parent link="l2"/><child link="foot"/></joint>'
+    )
+    masses = []
+    for more in ("", foot):
+        path = arm(tmp_path)
+        path.write_text(path.read_text().replace("</robot>", f"{more}</robot>"))
+        plant = read_robot(path).plant
+        masses.append(plant.CalcMassMatrix(plant.CreateDefaultContext()))
+    np.testing.assert_allclose(masses[1], masses[0], atol=1e-6)
+
+
 def mesh(uri, kind="collision"):
     return f'<{kind}><geometry><mesh filename="{uri}"/></geometry></{kind}>'
 

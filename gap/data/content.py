@@ -32,7 +32,7 @@ from makebreak.gap.data.servo_gains import (
     needed_efforts,
 )
 from makebreak.gap.data.turns import TURN, without_turns
-from makebreak.models.effects.kind import full_name, one_dof_joints
+from makebreak.models.effects.kind import actuator_of, full_name, one_dof_joints
 
 MOST_SAMPLES = 1000  # At which inverse dynamics is computed.
 MOST_SEC = 60.0  # Of a log that is looked at.
@@ -164,9 +164,10 @@ class Contents:
         if plant.num_positions() != len(joints) or not {*names, "time"} <= {*found}:
             raise ValueError("not all joints are measured")
         time = _si(columns, found["time"])
-        q = np.stack(
-            [without_turns(_si(columns, found[name]))[0] for name in names], axis=1
-        )
+        q = np.stack([_si(columns, found[name]) for name in names], axis=1)
+        for i, joint in enumerate(joints):
+            if not joint.prismatic:
+                q[:, i] = without_turns(q[:, i])[0]
         rows = np.flatnonzero(np.isfinite(q).all(axis=1) & np.isfinite(time))
         if not len(rows):
             raise ValueError("no row has all positions")
@@ -457,6 +458,11 @@ def _without_weight(contents: Contents, matches, said) -> None:
     efforts = _columns_of(contents, matches, _DRIVES)
     n, with_weight = len(names), contents.needed
     best = _assigned(_left(efforts, contents.of_effort, n), efforts)[1]
+    as_they_are = [contents.of_effort(name, i) for i, name in efforts.items()]
+    if best < np.log(TOLD_WELL) and all(
+        x is not None and GAINS[0] < x.factor < GAINS[1] for x in as_they_are
+    ):
+        return  # In one swing, weight and motion go with the same sine.
     contents.needed = with_weight - contents.weight
     after = _assigned(_left(efforts, contents.of_effort, n), efforts)[1]
     # Another direction of gravity leaves more.
@@ -742,6 +748,14 @@ def _factors(
         i: x for i, (_, x) in found.items()
         if x.explained > EXPLAINS and x.std < KNOWN_TO * abs(x.factor)
     }  # fmt: skip
+    rated = {i: _rated(contents.joints[i], x.factor) for i, x in known.items()}
+    if len(rated) > 1 and all(rated.values()) and any(map(_is_odd, known.values())):
+        part, word = next(filter(None, rated.values()))
+        return {
+            i: (float(np.sign(known[i].factor if i in known else 1.0)) * size, word)
+            for i in found if np.isfinite(size := part * contents.joints[i].effort)
+        }  # fmt: skip
+    every = known
     # One factor of all is no matter of their rotors.
     middle, within = _one_factor(list(known.values()))
     alike = within > 0.0 and len(known) > 1
@@ -752,13 +766,15 @@ def _factors(
         }  # fmt: skip
         middle, within = _one_factor(list(known.values()))
         alike = within > 0.0 and (len(known) > 1 or abs(middle) > 1.0)
-    odd = {i: x.factor for i, x in known.items()
-           if not GAINS[0] < x.factor < GAINS[1]}  # fmt: skip
+    odd = {i: x.factor for i, x in known.items() if _is_odd(x)}
     if not odd:
         return {}
-    # Loads and springs make some efforts larger, or smaller, but not all of them.
-    whole = len(known) == len(found) > 1 and len(odd) == len(known)
-    if not alike and not whole:
+    # Loads and springs make some efforts larger, or smaller, but not all of them; what
+    # two joints tell is no rotor is none at the others.
+    whole = len(every) == len(found) and all(map(_is_odd, every.values()))
+    if not alike and whole and len(known) > 1:
+        odd = {i: x.factor for i, x in every.items()}
+    elif not alike:
         odd = {i: f for i, f in odd.items()
                if f < 0.0 or not 1.0 / LARGE < f < LARGER}  # fmt: skip
     if alike:  # Of joints that do not tell, as of those that do.
@@ -768,6 +784,19 @@ def _factors(
         std = found[i][1].std if not alike else within
         out[i] = _in_words(factor, std)
     return out
+
+
+def _is_odd(x: Likeness) -> bool:
+    return not GAINS[0] < x.factor < GAINS[1]
+
+
+def _rated(joint: JointName, factor: float) -> tuple[float, str] | None:
+    """The part of a joint's effort limit that a factor is, if it is one that drives
+    count in."""
+    for part, word in ((1e-2, "per cent"), (1e-3, "per mille")):
+        if abs(abs(factor) / (part * joint.effort) - 1.0) < ALIKE:
+            return part, f"as if in {word} of each joint's effort limit"
+    return None
 
 
 def _one_factor(each: Sequence[Likeness]) -> tuple[float, float]:
@@ -841,7 +870,11 @@ def check_contents(
     """What channels' contents say against their names: until that is put right, an
     effect would only make up for it."""
     joints = [
-        JointName(full_name(plant, j), j.type_name() == "prismatic")
+        JointName(
+            full_name(plant, j),
+            j.type_name() == "prismatic",
+            effort=np.inf if (a := actuator_of(plant, j)) is None else a.effort_limit(),
+        )
         for j in sorted(one_dof_joints(plant), key=lambda j: j.position_start())
         if j.num_positions()
     ]

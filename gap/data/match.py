@@ -10,12 +10,14 @@ AS_SAID = "as the recording's sidecar says"
 
 @dataclass(frozen=True)
 class JointName:
-    """A joint of the robot. name: `<model>.<joint>`; limits in rad or m."""
+    """A joint of the robot. name: `<model>.<joint>`; limits in rad or m; effort: its
+    largest [N m] or [N]."""
 
     name: str
     prismatic: bool = False
     lower: float = -np.inf
     upper: float = np.inf
+    effort: float = np.inf
 
 
 @dataclass(frozen=True)

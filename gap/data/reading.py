@@ -1,7 +1,7 @@
 """Recordings read from tables and their sidecars, and checked."""
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path
@@ -40,12 +40,13 @@ def read_recordings(
     paths: Iterable[str | Path],
     skip_bad_rows: bool = False,
     sidecars: Mapping[Path, Path] | None = None,
+    slides: Container[str] = (),
 ) -> list[Recording]:
     """Several recordings, with names that tell them apart. Their time counts from the
     first row: a clock that runs fast does so from there, and not since 1970.
 
     Args: skip_bad_rows: as of read_recording. sidecars: {recording: sidecar}, where it
-        is not beside it.
+        is not beside it. slides: `<model>.<joint>` of joints that have no turns.
     Raises: ValueError as read_recording; if a file is given twice; for no file.
     """
     files = [Path(path) for path in paths]
@@ -63,7 +64,7 @@ def read_recordings(
         stems = [str(path) for path in files]
     each = [
         read_recording(
-            path, name, MOST_CELLS, skip_bad_rows, (sidecars or {}).get(path)
+            path, name, MOST_CELLS, skip_bad_rows, (sidecars or {}).get(path), slides
         )
         for path, name in zip(files, stems, strict=True)
     ]
@@ -78,6 +79,7 @@ def read_recording(
     most_cells: int = MOST_CELLS,
     skip_bad_rows: bool = False,
     sidecar_path: Path | None = None,
+    slides: Container[str] = (),
 ) -> Recording:
     """Reads a .csv, .npz or .parquet table, and what its sidecars say of it.
 
@@ -86,7 +88,7 @@ def read_recording(
 
     Args: skip_bad_rows: rows that cannot be read, that hold numbers beyond 1e12, or
         whose time does not increase, are left out and counted in a note. sidecar_path:
-        in place of the one beside it.
+        in place of the one beside it. slides: as of read_recordings.
     Raises: ValueError: one line with file, column, row, what came, what was expected.
     """
     path = Path(path)
@@ -110,7 +112,7 @@ def read_recording(
     spans = sidecar.get("ignore") or []
     episodes, more = without_ignored(path, episodes, time, spans)
     notes = [*done, *notes, *more, *_without_empty(path, columns)]
-    notes += _without_turns(path, columns, episodes)
+    notes += _without_turns(path, columns, episodes, slides)
     flips, norm_errors = mend_quaternions(path, columns, episodes, row)
     if is_excerpt:
         says = f"{path.name} has {n_rows} rows, too many to hold: {len(time)} of them "
@@ -251,11 +253,12 @@ def _without_empty(path: Path, columns: dict[str, np.ndarray]) -> list[tuple[str
     ]
 
 
-def _without_turns(path: Path, columns, episodes) -> list[tuple[str, str]]:
+def _without_turns(path: Path, columns, episodes, slides) -> list[tuple[str, str]]:
     """Undoes jumps of joints' positions by whole turns, in place, and says so."""
     notes = []
     for name, value in columns.items():
-        if name.rpartition(".")[2] not in ("position", "position_command"):
+        at, _, what = name.rpartition(".")
+        if what not in ("position", "position_command") or at in slides:
             continue
         n = 0
         for e in episodes:

@@ -58,6 +58,7 @@ from makebreak.models.effects.joints import ROTOR
 from makebreak.models.effects.kind import actuator_of, one_dof_joints
 from makebreak.models.fixed_joints import couplings_in, fix_joints
 from makebreak.models.model_files import checked_inertias, without_lost_collisions
+from makebreak.models.model_inertias import ModelText, mended
 from makebreak.models.robot_file import RobotFile
 from makebreak.models.scene_reader import given_packages
 
@@ -96,22 +97,23 @@ def read_robot(path: Path) -> Robot:
     bases = tuple(floating.get_body(i).name() for i in floating.GetFloatingBaseBodies())
     plant = _load(path, bases)
     model = re.sub(r"\W", "_", plant.GetModelInstanceName(_instance(plant)))
+    file = without_lost_collisions(path, given_packages())
     joints, limits = [], {}
     for joint in sorted(one_dof_joints(plant), key=lambda j: j.position_start()):
         name = f"{model}.{joint.name()}"
+        actuator = actuator_of(plant, joint)
+        limits[name] = np.inf if actuator is None else actuator.effort_limit()
         joints.append(
             JointName(
                 name,
                 joint.type_name() == "prismatic",
                 float(joint.position_lower_limits()[0]),
                 float(joint.position_upper_limits()[0]),
+                min(limits[name], file.limits.get(joint.name(), np.inf)),
             )
         )
-        actuator = actuator_of(plant, joint)
-        limits[name] = np.inf if actuator is None else actuator.effort_limit()
     if not joints:
         raise ValueError(f"robot {path} has no joint that turns or slides")
-    file = without_lost_collisions(path, given_packages())
     return Robot(path, model, tuple(joints), bases, limits, plant, file)
 
 
@@ -123,13 +125,29 @@ def _load(
 ) -> MultibodyPlant:
     """fixed: {joint, without the model's name: where it stands}; pose: of what is
     welded."""
-    plant = MultibodyPlant(0.0)
     file = without_lost_collisions(path, given_packages())
+
+    def of(text: str) -> MultibodyPlant:
+        return _plant(path, file, text, welded, fixed, pose)
+
+    plant = of(file.text)
+    if file.suffix != ".xml":
+        own = ModelText(plant.GetModelInstanceName(_instance(plant)), file.text)
+        try:  # Drake has 1 kg in place of an inertia that cannot be.
+            [after], _ = mended([own], lambda: plant)
+        except ValueError:  # Of one that matters the scene says it.
+            return plant
+        plant = plant if after is own else of(after.text)
+    return plant
+
+
+def _plant(path: Path, file: RobotFile, text: str, welded, fixed, pose):
+    plant = MultibodyPlant(0.0)
     try:
         with checked_inertias():
             # Without a scene graph no mesh is looked for.
             parser = Parser(plant)
-            models = parser.AddModelsFromString(file.text, file.suffix[1:])
+            models = parser.AddModelsFromString(text, file.suffix[1:])
         if len(models) != 1:
             raise ValueError(f"it holds {len(models)} models, expected one")
         for base in welded:
@@ -654,7 +672,12 @@ def _actuation(
     for what in ("effort_command", "effort_measured"):
         if joints := named(what):
             notes.append(f"the joints are driven by the recorded {what}")
-            untold = _untold(robot, every, logs, joints)
+            untold, passive = _untold(robot, every, logs, joints)
+            if passive:
+                notes.append(
+                    f"nothing drives {', '.join(passive)}, as {robot.path.name} gives "
+                    f"{'it' if len(passive) == 1 else 'them'} no drive"
+                )
             joints = [j.name for j in robot.joints if j.name in (*joints, *untold)]
             return [f"actuation: {{type: effort, joints: [{', '.join(joints)}]}}"], ""
     if joints := named("position_command"):
@@ -755,20 +778,24 @@ def _scaled(log: Log, matches: Sequence[Match]) -> dict[str, np.ndarray]:
     }
 
 
-def _untold(robot: Robot, every, logs, told: Collection[str]) -> list[str]:
-    """Joints without a column of what drives them that do not move as one that nothing
-    drives."""
-    if all(j.name in told for j in robot.joints):
-        return []
+def _untold(
+    robot: Robot, every, logs, told: Collection[str]
+) -> tuple[list[str], list[str]]:
+    """Of joints without a column of what drives them those that do not move as one that
+    nothing drives, and those that nothing drives by the robot's file."""
+    rest = [j.name for j in robot.joints if j.name not in told]
+    passive = [n for n in rest if n.partition(".")[2] in robot.file.passive]
+    if len(passive) == len(rest):
+        return [], passive
     motions = _motions(robot, every, logs)
     if robot.plant.num_positions() != len(robot.joints) or not motions:
-        return []
+        return [], passive
     shares = effort_shares(robot.plant, motions)
+    names = [j.name for j in robot.joints]
     return [
-        joint.name
-        for joint, share in zip(robot.joints, shares, strict=True)
-        if joint.name not in told and share > DRIVEN_SHARE
-    ]
+        name for name in rest
+        if name not in passive and shares[names.index(name)] > DRIVEN_SHARE
+    ], passive  # fmt: skip
 
 
 def _motions(robot: Robot, every, logs) -> list[ServoLog]:

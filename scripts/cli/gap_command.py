@@ -26,6 +26,8 @@ from makebreak.gap.report.files import write_report
 from makebreak.gap.report.mcap_file import write_mcap
 from makebreak.gap.report.summary import next_best, summary_lines, windows_of
 from makebreak.gap.result import GapResult
+from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.effects.kind import sliding_joints
 from makebreak.models.scene import Scene, read_scene
 from makebreak.models.typed_yaml import read_yaml
 from makebreak.scripts.cli.arguments import BUDGET_MIN
@@ -160,7 +162,10 @@ def run_and_report(
                     result = replace(result, checks=[*result.checks, *said])
                 progress("writing the report")
                 scene = read_scene(scene_path)
-                recordings = read_recordings(recording_paths, skip_bad_rows, sidecars)
+                slides = sliding_joints(SceneDynamics(scene).plant)
+                recordings = read_recordings(
+                    recording_paths, skip_bad_rows, sidecars, slides
+                )
                 with budget.part(REPORT):
                     moving = budget.if_time(
                         NO_ANIMATION,

@@ -11,6 +11,8 @@ from tempfile import TemporaryDirectory
 
 from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.simulation.judge import judge
+from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.effects.kind import sliding_joints
 from makebreak.models.scene import read_scene
 from makebreak.scripts.cli.gap_command import known_sidecars
 from makebreak.scripts.runner.table import Table
@@ -32,7 +34,8 @@ def judge_scenes(
         sidecars, _ = known_sidecars(
             Path(scenes[0]), recordings, Path(folder).joinpath, sidecar
         )
-        tables = read_recordings(recordings, sidecars=sidecars)
+        slides = sliding_joints(SceneDynamics(read_scene(scenes[0])).plant)
+        tables = read_recordings(recordings, sidecars=sidecars, slides=slides)
     judged = [judge(read_scene(path), tables, window_sec) for path in scenes]
     first = judged[0]
     rows: list[tuple] = []
