@@ -559,8 +559,9 @@ def _learn_parameters(rig: _Rig) -> _Learned:
     learner = ParameterLearner(model, settings, LEARN, OFFSET["learner"])
     users = [rig.lcs["plan"], rig.lcs["command"]]
     r_comp = add_parameter_learner(
-        rig.builder, learner, rig.estimator, "window_valid", users, N_TIP, LEARN
-    )
+        rig.builder, learner, rig.estimator, "window_valid", users, N_TIP, LEARN,
+        "u_with_force",
+    )  # fmt: skip
     return _Learned(r_comp, add_gap_std(rig.builder, learner, LEARN))
 
 

@@ -42,20 +42,22 @@ def add_parameter_learner(
     learner: ParameterLearner,
     state: LeafSystem,
     ready: str,
-    users: list[LeafSystem],
+    users: Sequence[LeafSystem],
     rows: int,
     dt_sec: float,
+    u: str = "u_measured",
 ) -> OutputPort:
     """Adds `parameter_learner`, and gives what it learns but the gap to the users.
 
-    Args: state: has x, u_measured and the port `ready`; users: their port `parameters`
-        has all but the gap, in order; rows: the first ones of the LCS, whose gap is
-        learned; dt_sec: time step over which a residual is a velocity [s].
+    Args: state: has x and the ports `u` and `ready`; users: their port `parameters` has
+        all but the gap, in order, and the first one builds the LCS; rows: the first
+        ones of it, whose gap is learned; dt_sec: time step over which a
+        residual is a velocity [s].
     Returns: the gap as r_comp (n_lam,) [m/s], of the system `learned_residual`.
     """
     builder.AddNamedSystem("parameter_learner", learner)
     for name, port in (
-        ("x", "x"), ("u_measured", "u_measured"), (ready, "enable"),
+        ("x", "x"), (u, "u_measured"), (ready, "enable"),
     ):  # fmt: skip
         wiring.connect(builder, state, name, learner, port)
     items = learner.model.parameters.items
@@ -64,7 +66,7 @@ def add_parameter_learner(
         values = _gain(builder, "learned_values", learner, np.eye(len(items))[~is_gap])
         for user in users:
             builder.Connect(values, user.GetInputPort("parameters"))
-    residual = np.zeros((learner.model.n_lam, len(items)))
+    residual = np.zeros((users[0].model.n_lam, len(items)))
     residual[:rows, is_gap] = 1.0 / dt_sec
     return _gain(builder, "learned_residual", learner, residual)
 

@@ -179,12 +179,12 @@ def make_push_object(
                 LEARN,
                 OFFSET["learner"],
             )
-            ready = "window_valid" if past is estimator else "ready"
+            u, ready = _u_and_ready(past)
             r_comp = add_parameter_learner(
-                builder, parameter_learner, past, ready, users, N_TIP, LEARN
+                builder, parameter_learner, past, ready, users, N_TIP, LEARN, u
             )
         else:
-            learner = _add_learner(builder, config, lcs["learn"], past, estimator)
+            learner = _add_learner(builder, config, lcs["learn"], past)
             r_comp = _switchable(builder, learner.GetOutputPort("r_comp"), meshcat)
         for system in (planning.c3, planning.sampler):
             builder.Connect(r_comp, system.GetInputPort("r_comp"))
@@ -500,17 +500,25 @@ def _add_past_state(builder, config, model, sensor, estimator) -> PastState:
     )
     connect = partial(wiring.connect, builder)
     connect(estimator, "x", past, "x")
-    connect(estimator, "u_measured", past, "u_measured")
+    connect(estimator, "u_with_force_now", past, "u")
     connect(sensor, "readings", past, "readings")
     return past
 
 
-def _add_learner(builder, config, lcs, past, estimator) -> ResidualLearner:
+def _u_and_ready(past: PastState | StateEstimator) -> tuple[str, str]:
+    """Ports of what gives samples: the input, and whether the sample is known."""
+    if isinstance(past, PastState):
+        return "u_measured", "ready"
+    return "u_with_force", "window_valid"
+
+
+def _add_learner(builder, config, lcs, past) -> ResidualLearner:
     """Args: past: the PastState, or the estimator where there is none."""
+    u, ready = _u_and_ready(past)
     learner = builder.AddNamedSystem(
         "residual_learner",
         ResidualLearner(
-            learner_config(config.learning, late=past is estimator),
+            learner_config(config.learning, late=not isinstance(past, PastState)),
             lcs.model.at_default(),
             LEARN,
             OFFSET["learner"],
@@ -518,8 +526,7 @@ def _add_learner(builder, config, lcs, past, estimator) -> ResidualLearner:
     )
     connect = partial(wiring.connect, builder)
     connect(past, "x", learner, "x")
-    connect(past, "u_measured", learner, "u_measured")
-    ready = "window_valid" if past is estimator else "ready"
+    connect(past, u, learner, "u_measured")
     connect(past, ready, learner, "enable")
     connect(lcs, "lcs", learner, "lcs")
     return learner

@@ -62,6 +62,11 @@ OFFSET = dict(
 )  # fmt: skip
 PLAN_DT = 0.1  # Time step of the planner's LCS [s].
 TIP_MASS = 1.0  # Mass of the point that stands for the arm in the planner's model [kg].
+# Friction of tip and object along the vertical over that across it, for the learner of
+# parameters. A finger that leans touches the object's upper edge, whose normal is
+# tilted by up to half a right angle, and presses or lifts more than the tip's sphere,
+# which alone is modelled, could by friction.
+LEANING = 4.0
 N_TIP = 4  # The first entries of lam: the contact of tip and object.
 # Settings of the systems that make_push_object computes, so that users cannot.
 SET_BY_DIAGRAM = {
@@ -140,7 +145,7 @@ class PushParametersConfig:
     gap: float = 0.004  # Deviation of the distance of tip and object [m].
     # Deviation of the object's centre of mass along x and along y [m].
     com: float = 0.0
-    # Weights Q_d of the velocities along x and y of tip and object [s2/m2].
+    # Weights Q_d of the tip's velocities, and of the object's along x and y [s2/m2].
     weight: float = 4e3
     # Radius at which the object's turning counts with the same weight [m].
     turn_radius: float = 0.05
@@ -324,9 +329,10 @@ def parameter_learner_config(
     own: PushParametersConfig, pairs: list[ContactPair], items: list[Parameter]
 ) -> ParameterLearnerConfig:
     """Config of the learner of these parameters of contact_pairs."""
+    pairs = [replace(pairs[0], anisotropy=LEANING), *pairs[1:]]
     Q_d = np.zeros(N_X)
-    for part in (V_TIP, V_BALL):
-        Q_d[part.start : part.start + 2] = own.weight
+    Q_d[V_TIP] = own.weight
+    Q_d[V_BALL.start : V_BALL.start + 2] = own.weight
     Q_d[W_BALL.start + 2] = own.weight * own.turn_radius**2
     return ParameterLearnerConfig(pairs, items, Q_d.tolist(), own.contact_std)
 
@@ -338,7 +344,9 @@ def past_config(pose: PoseSensorConfig, height: float) -> PastStateConfig:
     Args: height: of the object's frame [m].
     Raises: ValueError for readings that are too rare or too late.
     """
-    plain = PastStateConfig(height=height, period_sec=LEARN, offset_sec=OFFSET["past"])
+    plain = PastStateConfig(
+        height=height, period_sec=LEARN, tick_sec=ESTIMATE, offset_sec=OFFSET["past"]
+    )
     # A parabola needs two readings on either side, and one is lost between ticks.
     half_width = max(plain.half_width, 2.5 * pose.period_sec)
     wait = pose.delay_sec + pose.period_sec + half_width

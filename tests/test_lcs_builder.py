@@ -575,6 +575,8 @@ def test_an_ambiguous_name_is_refused_with_the_scoped_ones():
         (dict(friction_directions=0), "friction_directions is 0"),
         (dict(friction_directions=1.5), "friction_directions is 1.5"),
         (dict(tangent=[1.0]), "tangent is"),
+        (dict(anisotropy=2.0), "anisotropy is 2.0, expected .* 1 without a tangent"),
+        (dict(anisotropy=-1.0, tangent=[0.0, 0.0, 1.0]), "anisotropy is -1.0"),
         (dict(b="ball_link"), "same body"),
     ],
 )
@@ -584,6 +586,20 @@ def test_a_bad_pair_is_refused(ball_diagram, change, message):
         setattr(pair, name, value)
     with pytest.raises(ValueError, match=message):
         AnitescuLcs(ball_diagram, [pair])
+
+
+@pytest.mark.parametrize("analytic", [True, False])
+def test_friction_may_differ_along_a_direction(ball_diagram, analytic):
+    def pushes(anisotropy):
+        pair = ContactPair("ball_link", "table_link", 0.5, tangent=[1.0, 0.0, 0.0])
+        pair.anisotropy = anisotropy
+        return AnitescuLcs(ball_diagram, [pair], analytic=analytic).at_default().J
+
+    even, uneven = pushes(1.0), pushes(3.0)
+    along, across = even[0] - even[1], even[2] - even[3]
+    np.testing.assert_allclose(uneven[0] - uneven[1], 3.0 * along, atol=1e-12)
+    np.testing.assert_allclose(uneven[2] - uneven[3], across, atol=1e-12)
+    np.testing.assert_allclose(uneven.sum(axis=0), even.sum(axis=0), atol=1e-12)
 
 
 def test_bad_parameters_are_refused(ball_diagram):

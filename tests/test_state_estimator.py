@@ -16,6 +16,7 @@ from makebreak.systems.contact_mpc.numerics.ball_state import (
     W_BALL,
 )
 from makebreak.systems.perception.numerics.state_estimator import (
+    input_with_force,
     observe_force,
     tip_mobility,
     tip_motion,
@@ -130,6 +131,47 @@ def test_before_the_first_reading_the_tip_is_at_its_default_and_nothing_is_valid
     p_tip = tip.CalcPoseInWorld(arm.CreateDefaultContext()).translation()
     np.testing.assert_allclose(x[P_TIP], p_tip, atol=1e-14)
     assert np.isfinite(x).all() and (u == 0.0).all() and valid == 0.0
+
+
+def test_the_input_beside_the_real_force_makes_the_point_move_as_the_tip(arm, chain):
+    """An arm that is pushed at the tip in Drake: (input + force) / m is the tip's
+    acceleration, though the tip has not the point's mass."""
+    rng = np.random.default_rng(3)
+    for _ in range(5):
+        q, v, torque, _, v_tip, free = random_motion(arm, rng)
+        force, dt = rng.normal(0.0, 10.0, 3), 1e-3
+        context = arm.CreateDefaultContext()
+        arm.SetPositions(context, q)
+        J = arm.CalcJacobianTranslationalVelocity(
+            context, JacobianWrtVariable.kV, arm.GetFrameByName(TIP_FRAME), np.zeros(3),
+            arm.world_frame(), arm.world_frame(),
+        )  # fmt: skip
+        a = free + J @ np.linalg.solve(arm.CalcMassMatrix(context), J.T @ force)
+        u = tip_motion(chain, q, v, torque, MASS)[2]
+        found = input_with_force(
+            u, v_tip - dt * a, v_tip, tip_mobility(chain, q), MASS, dt
+        )
+        np.testing.assert_allclose((found + force) / MASS, a, atol=1e-8)
+
+
+def test_the_input_beside_a_force_is_averaged_and_missing_where_a_reading_is(bench):
+    def read():
+        return [
+            bench.estimator.GetOutputPort(name).Eval(bench.context)
+            for name in ("u_with_force_now", "u_with_force")
+        ]
+
+    rng, found = np.random.default_rng(4), []
+    for k in range(8):
+        torque = np.full(7, np.nan) if k == 2 else rng.normal(0.0, 10.0, 7)
+        bench.tick(torque=torque)
+        now, mean = read()
+        found.append(now)
+        if k >= N_WINDOW - 1:  # Not a number as long as one of them is not.
+            np.testing.assert_allclose(mean, np.mean(found[-N_WINDOW:], axis=0))
+    # A change of speed is known between two good readings.
+    known = [bool(np.isfinite(u).all()) for u in found]
+    assert known == [True, True, False, False, True, True, True, True]
 
 
 def test_u_measured_is_the_mean_of_the_window_and_forgets_what_is_older(bench, chain):

@@ -37,6 +37,10 @@ from makebreak.systems.numerics.timing import timed
 
 DIFFERENCE = 1e-6  # Of a parameter of pairs, for its derivatives.
 NINETY = 1.645  # Deviations of a 90 % interval.
+# Least number of friction directions of a contact, but in a plane. A friction cone of
+# two holds a force between its edges that is up to 29 %, on average 10 %, less than the
+# largest, and friction would be learned as that much larger; four: 8 %, on average 3 %.
+DIRECTIONS = 4
 GAP_STARTS = (-2.0, -1.0, 1.0, 2.0)  # Deviations of a gap to look for contact at.
 
 
@@ -139,7 +143,7 @@ class ParameterLearner(LeafSystem):
                 )
         self.model = m = AnitescuLcs(
             diagram,
-            c.contacts,
+            [_finer(pair) for pair in c.contacts],
             period_sec,
             closest=c.closest,
             parameters=c.parameters,
@@ -302,3 +306,9 @@ class ParameterLearner(LeafSystem):
         impacts = c.impact_share**2 * impact_part(lcs, sample, lacks)
         share = np.sqrt(c.error_share**2 + impacts)
         return error_weights(self._Q_d, share, lacks, sample.M, further)
+
+
+def _finer(pair: ContactPair) -> ContactPair:
+    if pair.plane_normal or pair.friction_directions >= DIRECTIONS:
+        return pair
+    return replace(pair, friction_directions=DIRECTIONS)

@@ -1,6 +1,6 @@
 """The state at a past time, without the lag of a filter (numerics/past_state.py)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from pydrake.common.value import Value
@@ -27,23 +27,54 @@ class PastStateConfig:
     ticks: int = 4  # How many periods ago.
     half_width: float = 0.1  # Readings within this time before and after are used [s].
     height: float = 0.02  # Of the object's origin on the table [m].
-    period_sec: float = 0.05  # The learner's.
+    period_sec: float = 0.05  # The learner's, a multiple of tick_sec.
+    tick_sec: float = 0.0125 / 3.0  # Period of x and u [s].
     offset_sec: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Memory:
+    """Of the last ticks: the time, and the tip's position beside the input's second
+    integral over time, which is to the input what the position is to the acceleration.
+    """
+
+    ticks: tuple = ()  # (time, (6,)) of each.
+    rate: np.ndarray = field(default_factory=lambda: np.zeros(3))  # First integral.
+    impulse: np.ndarray | None = None  # Filtered, at the last time that was known.
+
+    def __deepcopy__(self, memo):
+        return self  # Every part is immutable.
+
+    @property
+    def beside(self):
+        times, values = zip(*self.ticks, strict=True) if self.ticks else ((), ())
+        return times, np.reshape(values, (-1, 6))
+
+    def with_tick(self, t, p_tip, u, dt, n_kept: int) -> "_Memory":
+        """A tick later; empty after one that is not finite."""
+        if not (np.isfinite(p_tip).all() and np.isfinite(u).all()):
+            return _Memory()
+        rate, twice = self.rate + dt * u, np.zeros(3)
+        if self.ticks:
+            twice = self.ticks[-1][1][3:] + 0.5 * dt * (self.rate + rate)
+        ticks = (*self.ticks, (t, np.append(p_tip, twice)))[-n_kept:]
+        return _Memory(ticks, rate, self.impulse)
 
 
 class PastState(LeafSystem):
     """State of tip and object some periods ago, for a learner that can wait.
 
-    The tip's state is measured at once and stored. The object's pose comes from the
-    readings before and after that time (numerics/past_state.py), laid on the table. Tip
-    and object are then of the same time, which a filter's present estimates are not
-    while the object's motion changes.
+    The object's pose comes from the readings before and after that time, and the tip
+    and the input go through the same filter (numerics/past_state.py). So tip and object
+    are of the same time, which a filter's present estimates are not while the object's
+    motion changes, and a force lasts as long as the motion that it explains. The
+    object is laid on the table.
 
-    Inputs:  x (19,) of contact_mpc/numerics/ball_state.py (only the tip is used);
-             u_measured (3,): mean over the last period [N]; readings (abstract) of
-             PoseSensor.
-    Outputs: x (19,), u_measured (3,) of that time; ready (1,): 1 if both are known,
-             else they are the last known ones.
+    Inputs:  x (19,) of contact_mpc/numerics/ball_state.py (only the tip's position is
+             used); u (3,): over the last tick [N]; readings (abstract) of PoseSensor.
+    Outputs: x (19,) of that time, u_measured (3,): filtered, over the period before it
+             (zero at the first known time); ready (1,): 1 if both are known, else they
+             are the last known ones.
     """
 
     def __init__(self, config: PastStateConfig, axis=(0.0, 0.0, 0.0)):
@@ -59,12 +90,21 @@ class PastState(LeafSystem):
                 f"half_width is {config.half_width} and period_sec "
                 f"{config.period_sec}, expected more than 0"
             )
+        every = config.period_sec / config.tick_sec if config.tick_sec > 0.0 else 0.0
+        if round(every) < 1 or abs(every - round(every)) > 1e-6:
+            raise ValueError(
+                f"period_sec is {config.period_sec}, expected a multiple of tick_sec, "
+                f"{config.tick_sec}"
+            )
+        self._every = round(every)
+        # Ticks that the parabola of the oldest time reaches over, and one more.
+        span = config.ticks * config.period_sec + config.half_width
+        self._n_kept = int(np.ceil(span / config.tick_sec)) + 2
         self._config, self._axis = config, np.array(axis, dtype=float)
         self._x = self.DeclareVectorInputPort("x", N_X)
-        self._u = self.DeclareVectorInputPort("u_measured", 3)
+        self._u = self.DeclareVectorInputPort("u", 3)
         self._readings = self.DeclareAbstractInputPort("readings", Value[object](()))
-        # (time, tip's position and velocity, force) of each tick.
-        self._memory = self.DeclareAbstractState(Value[object](()))
+        self._memory = self.DeclareAbstractState(Value[object](_Memory()))
         at_rest = np.zeros(N_X)
         at_rest[Q_BALL.start] = 1.0
         self._past = self.DeclareDiscreteState(at_rest)
@@ -74,28 +114,37 @@ class PastState(LeafSystem):
         self.DeclareStateOutputPort("u_measured", self._force)
         self.DeclareStateOutputPort("ready", self._ready)
         self.DeclarePeriodicUnrestrictedUpdateEvent(
-            config.period_sec, config.offset_sec, self._update
+            config.tick_sec, config.offset_sec, self._update
         )
 
     @timed
     def _update(self, context, state):
         c, t = self._config, context.get_time()
-        ticks = context.get_abstract_state(int(self._memory)).get_value()
+        memory = context.get_abstract_state(int(self._memory)).get_value()
         x, u = (np.array(port.Eval(context)) for port in (self._x, self._u))
-        ticks = (*ticks, (t, x[P_TIP], x[V_TIP], u))[-c.ticks - 1 :]
-        state.get_mutable_abstract_state(int(self._memory)).set_value(ticks)
-        discrete = state.get_mutable_discrete_state()
-        at, p_tip, v_tip, force = ticks[0]
-        pose = None
-        if len(ticks) == c.ticks + 1 and np.isfinite([*p_tip, *v_tip, *force]).all():
-            pose = pose_at(at, self._readings.Eval(context), c.half_width)
-        discrete.set_value(int(self._ready), [0.0 if pose is None else 1.0])
-        if pose is None:
-            return
-        p, v, q, w = pose
-        p, v, q, w = on_the_table(0.0, p, v, q, w, c.height, self._axis)
+        memory = memory.with_tick(t, x[P_TIP], u, c.tick_sec, self._n_kept)
+        if round((t - c.offset_sec) / c.tick_sec) % self._every == 0:
+            at = t - c.ticks * c.period_sec
+            found = pose_at(
+                at, self._readings.Eval(context), c.half_width, memory.beside
+            )
+            discrete = state.get_mutable_discrete_state()
+            discrete.set_value(int(self._ready), [0.0 if found is None else 1.0])
+            impulse = None
+            if found is not None:
+                impulse = found[5][3:]
+                self._put(discrete, found, impulse, memory.impulse)
+            memory = replace(memory, impulse=impulse)
+        state.get_mutable_abstract_state(int(self._memory)).set_value(memory)
+
+    def _put(self, discrete, found, impulse, before) -> None:
+        p, v, q, w, beside, rates = found
+        p, v, q, w = on_the_table(0.0, p, v, q, w, self._config.height, self._axis)
         past = np.zeros(N_X)
-        past[P_TIP], past[V_TIP] = p_tip, v_tip
+        past[P_TIP], past[V_TIP] = beside[:3], rates[:3]
         past[P_BALL], past[V_BALL], past[Q_BALL], past[W_BALL] = p, v, q, w
+        force = np.zeros(3)
+        if before is not None:
+            force = (impulse - before) / self._config.period_sec
         discrete.set_value(int(self._past), past)
         discrete.set_value(int(self._force), force)

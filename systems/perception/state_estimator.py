@@ -1,6 +1,7 @@
 """State and input of the LCS from sensors (numerics/state_estimator.py)."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from pydrake.systems.framework import LeafSystem
@@ -13,6 +14,7 @@ from makebreak.systems.numerics.settings import check_settings
 from makebreak.systems.numerics.timing import timed
 from makebreak.systems.perception.numerics.state_estimator import (
     estimate,
+    input_with_force,
     observe_force,
     tip_mobility,
     tip_motion,
@@ -37,7 +39,9 @@ class StateEstimator(LeafSystem):
 
     In the LCS the arm is a point with a mass; u_measured is the force on this point
     that explains the tip's motion (numerics/state_estimator.py), averaged over the
-    window, as the residual learner needs it.
+    window, as the residual learner needs it. It makes of a contact force the one that
+    would push the point so. Who learns masses and friction needs the real one, and
+    takes u_with_force.
 
     Inputs:  q (7,) [rad], v (7,) [rad/s], torque (7,): of the motors [N m]; p_ball (3,)
              [m], v_ball (3,) [m/s], seen (1,): of a tracker; optional, both for an
@@ -47,7 +51,11 @@ class StateEstimator(LeafSystem):
              valid (1,): 1 if all readings but torque are finite and the object is seen,
              0 if it is not seen, -1 if one is not finite; window_valid (1,): 1 if valid
              was 1 and torque finite during the whole window; tip_force (3,) [N]:
-             estimated contact force on the tip, from joint torques and velocities.
+             estimated contact force on the tip, from joint torques and velocities;
+             u_with_force (3,) [N]: the input that explains the tip's motion beside the
+             contact force on the real tip, averaged over the window, and
+             u_with_force_now (3,), over the last period; not a number where a reading
+             was missing.
 
     x, u_measured and tip_force are held while a reading is not finite. While torque
     alone is not, x goes on, and only the forces are held.
@@ -89,6 +97,7 @@ class StateEstimator(LeafSystem):
         )
         self._valid = self.DeclareDiscreteState(1)
         self._observer = self.DeclareDiscreteState(7)
+        self._with_force = self.DeclareDiscreteState(3 * n_window)
         self._gain, self._dt = config.force_bandwidth, config.period_sec
         self.DeclareStateOutputPort("x", self._x)
         self.DeclareVectorOutputPort(
@@ -104,6 +113,11 @@ class StateEstimator(LeafSystem):
             self._tip_force,
             prerequisites_of_calc={self.discrete_state_ticket(self._observer)},
         )
+        ticket = {self.discrete_state_ticket(self._with_force)}
+        for name, last in (("u_with_force", n_window), ("u_with_force_now", 1)):
+            self.DeclareVectorOutputPort(
+                name, 3, partial(self._mean_with_force, last), ticket
+            )
         self.DeclareStateOutputPort("valid", self._valid)
         self.DeclareVectorOutputPort(
             "window_valid",
@@ -128,10 +142,15 @@ class StateEstimator(LeafSystem):
         observer.setflags(write=False)
         mobility = tip_mobility(self._chain, q_default)
         observe_force(observer, at, at, mobility, self._gain, self._dt)
+        input_with_force(at, at, at, mobility, self._tip_mass, self._dt)
 
     def _mean_force(self, context, output):
         window = context.get_discrete_state(self._window).value()
         output.SetFromVector(window[:-1].reshape(-1, 3).mean(axis=0))
+
+    def _mean_with_force(self, last, context, output):
+        window = context.get_discrete_state(self._with_force).value()
+        output.SetFromVector(window.reshape(-1, 3)[-last:].mean(axis=0))
 
     def _tip_force(self, context, output):
         output.SetFromVector(context.get_discrete_state(self._observer).value()[3:6])
@@ -146,6 +165,7 @@ class StateEstimator(LeafSystem):
         window = np.zeros(3 * self._n_window + 1)
         context.SetDiscreteState(self._window, window)
         context.SetDiscreteState(self._observer, np.zeros(7))
+        context.SetDiscreteState(self._with_force, np.zeros(window.size - 1))
 
     @timed
     def _update(self, context, discrete_state):
@@ -171,17 +191,24 @@ class StateEstimator(LeafSystem):
                 np.asarray(self._w_object.Eval(context)),
             )
         discrete_state.set_value(self._valid, [valid])
+        with_force = np.full(3, np.nan)
         if finite:
             discrete_state.set_value(self._x, x)
             discrete_state.set_value(self._window, after)
             observer = context.get_discrete_state(self._observer).value()
             if felt:
                 u = after[-4:-1]
+                mobility = tip_mobility(self._chain, np.asarray(self._q.Eval(context)))
+                if window[-1] > 0.0:  # The last reading was good, too.
+                    v_before = context.get_discrete_state(self._x).value()[V_TIP]
+                    with_force = input_with_force(
+                        u, v_before, x[V_TIP], mobility, self._tip_mass, self._dt
+                    )
                 observer = observe_force(
                     observer,
                     x[V_TIP],
                     u / self._tip_mass,
-                    tip_mobility(self._chain, np.asarray(self._q.Eval(context))),
+                    mobility,
                     self._gain,
                     self._dt,
                 )
@@ -190,3 +217,5 @@ class StateEstimator(LeafSystem):
             discrete_state.set_value(self._observer, observer)
         else:
             discrete_state.set_value(self._window, np.append(window[:-1], 0.0))
+        forces = context.get_discrete_state(self._with_force).value()[3:]
+        discrete_state.set_value(self._with_force, np.append(forces, with_force))

@@ -50,6 +50,8 @@ class ContactPair:
     stiffness: float | None = None
     # Number of contacts, the nearest combinations of geometries; None: all.
     closest: int | None = None
+    # Friction along `tangent` over that across it.
+    anisotropy: float = 1.0
 
 
 @dataclass
@@ -103,7 +105,7 @@ def _combinations(number: int, pair: ContactPair, named: "_NamedGeometries"):
     of_a, of_b = named.find(pair.a), named.find(pair.b)
     name = f"{pair.a}~{pair.b}"
     reference, planar = _check_pair(name, pair)
-    edges = friction_edges(int(pair.friction_directions))
+    edges = friction_edges(int(pair.friction_directions)) * [pair.anisotropy, 1.0]
     if planar:  # t1 follows the plane's normal, so the edges start at t2.
         edges = edges[:, ::-1] * [-1.0, 1.0]
     compliance = 0.0 if pair.stiffness is None else 1.0 / pair.stiffness
@@ -164,6 +166,13 @@ def _check_pair(name: str, pair: ContactPair) -> tuple[np.ndarray, bool]:
         raise ValueError(
             f"{name}: friction_directions is 1 without a direction, expected "
             "a plane_normal (of a plant in a plane) or a tangent"
+        )
+    if not 0.0 < pair.anisotropy < np.inf or (
+        pair.anisotropy != 1.0 and not pair.tangent
+    ):
+        raise ValueError(
+            f"{name}: anisotropy is {pair.anisotropy}, expected a positive number, and "
+            "1 without a tangent"
         )
     if pair.stiffness is not None and not 0.0 < pair.stiffness < np.inf:
         raise ValueError(

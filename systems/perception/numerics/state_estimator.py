@@ -45,6 +45,22 @@ def tip_mobility(chain, q):
 
 
 @numba.njit(cache=True)
+def input_with_force(u, v_before, v_tip, mobility, tip_mass, dt):
+    """The LCS's input that explains the tip's motion beside the real contact force.
+
+    The contact force that the motion shows is F = (J M^-1 J')^-1 (a - u / m), with the
+    tip's own mobility: two to three times what would move a point of mass m so, as the
+    tip seems heavier. With the input m a - F, the point moves as the tip did under F.
+
+    Args: u (3,): of tip_motion [N]; v_before, v_tip (3,): at the ends of dt [s];
+        mobility (3, 3) [1/kg]; tip_mass: m [kg].
+    Returns: (3,) [N].
+    """
+    a = (v_tip - v_before) / dt
+    return tip_mass * a - np.linalg.solve(mobility, a - u / tip_mass)
+
+
+@numba.njit(cache=True)
 def observe_force(observer, v_tip, a_free, mobility, gain, dt):
     """A momentum observer of the external force on the tip.
 
