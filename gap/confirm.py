@@ -9,6 +9,7 @@ it. Nothing is chosen by its value here.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.stats import ttest_1samp
@@ -27,7 +28,7 @@ from makebreak.gap.thresholds import (
     SAME_ERROR,
     SIMULATED_RIVAL_GAIN,
 )
-from makebreak.gap.verdict import figure
+from makebreak.gap.verdict import closed_at, figure
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
 
@@ -90,7 +91,7 @@ def _vetoes(
     problem: GapProblem, selection: Selection, gap: GapMeasure, judge: Judge
 ) -> list[Veto]:
     """Of the effects that act where held-out data get worse with all of them the last
-    ones; all of them where what they close is no confirmation."""
+    ones; else those of which what is closed is no confirmation."""
     choices = selection.choices
     if not gap.is_measured:
         why = gap.failure or "It could not be judged by simulation."
@@ -115,9 +116,15 @@ def _vetoes(
             )
     if found:
         return [(choices[k], why) for k, why in found.items()]
-    if not is_confirmed(gap):
-        return [(choice, not_confirmed(gap)) for choice in choices]
-    return []
+
+    def at(choice: Choice, channel: str) -> bool:
+        return acts_on(problem, choice.effect, channel.rsplit(".", 1)[0])
+
+    return [
+        (choice, not_confirmed(gap))
+        for choice in choices
+        if not is_confirmed(gap, partial(at, choice))
+    ]
 
 
 def _needless(
@@ -296,12 +303,13 @@ def _moves(problem: GapProblem, joint: str, body: str) -> bool:
 # ----- What held-out data confirm
 
 
-def is_confirmed(gap: GapMeasure) -> bool:
-    """Whether simulated windows do better with what is named; where they show no gap
-    without it, whether they show none with it, and the equations of motion say the same
-    of what shows in them."""
+def is_confirmed(gap: GapMeasure, acts_at: Callable[[str], bool]) -> bool:
+    """Whether simulated windows do better with what is named, all together or the
+    channels at which an effect acts; where they show no gap without it, whether they
+    show none with it, and the equations of motion say the same of what shows in
+    them."""
     if gap.before > AGREEMENT_RMS_MAX:
-        return gap.reduction >= CLOSED_SHARE_MIN
+        return closed_at(gap, acts_at) >= CLOSED_SHARE_MIN
     return gap.after <= AGREEMENT_RMS_MAX and _equations_confirm(gap)
 
 

@@ -234,7 +234,7 @@ class _Free:
             (i, name)
             for i, effect in enumerate(start)
             for name in effect.parameters
-            if name not in fixed[i]
+            if name not in fixed[i] and not KINDS[effect.kind].parameter(name).given
         ]
         self.scale = np.array([size_of(start[i], name) for i, name in self.names])
         least = [problem.dynamics.least(e.kind, e.at) for e in start]

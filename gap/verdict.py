@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from math import isfinite
 
 from pydrake.multibody.plant import MultibodyPlant
@@ -160,6 +161,17 @@ def decide(facts: Facts) -> tuple[str, str]:
     return next((verdict, says(facts)) for holds, verdict, says in rows if holds(facts))
 
 
+def closed_at(gap: GapMeasure, acts_at: Callable[[str], bool]) -> float:
+    """Share of the gap that is closed: of the whole, or of that of one of an effect's
+    own channels, whichever is more."""
+    own = [
+        1.0 - share_left(each["before"], each["after"])
+        for name, each in gap.per_channel.items()
+        if each["before"] > AGREEMENT_RMS_MAX and acts_at(name)
+    ]
+    return max([gap.reduction, *own])
+
+
 def too_weak(
     facts: Facts, closed: float, acts_on: Callable[[Choice, str], bool]
 ) -> list[tuple[Choice, str]]:
@@ -175,12 +187,8 @@ def too_weak(
     for choice in facts.choices:
         most = closed
         if facts.chosen_on is not None:
-            own = [
-                1.0 - share_left(each["before"], each["after"])
-                for name, each in facts.chosen_on.per_channel.items()
-                if each["before"] > AGREEMENT_RMS_MAX and acts_on(choice, name)
-            ]
-            most = min(closed, max([facts.chosen_on.reduction, *own]))
+            own = closed_at(facts.chosen_on, partial(acts_on, choice))
+            most = min(closed, own)
         if most < CLOSED_SHARE_MIN:
             why = f"It closes {max(most, 0.0):.0%} of the gap, too little to be named."
             weak.append((choice, why))

@@ -80,7 +80,7 @@ from makebreak.models.scene_schema import (
     check_scene,
 )
 from makebreak.models.typed_yaml import nearest, one_line
-from makebreak.systems.numerics.joint_laws import LAWS, JointLaws
+from makebreak.systems.numerics.joint_laws import LAWS, N_NUMBERS, JointLaws
 
 __all__ = [
     "CHANNEL_STEPS",
@@ -413,7 +413,7 @@ def joint_laws(effects: Sequence[Effect], plant: MultibodyPlant) -> JointLaws:
         for joint in find_joints(effect, plant)
         for numbers in [kind.joint_numbers(effect, plant, joint)]
     ]
-    p = np.zeros((len(rows), 4))
+    p = np.zeros((len(rows), N_NUMBERS))
     for row, (_, _, numbers) in zip(p, rows, strict=True):
         row[: len(numbers)] = numbers
     joint, kind = ([row[k] for row in rows] for k in (0, 1))

@@ -23,7 +23,15 @@ from makebreak.systems.arm.impedance_controller import (
 from makebreak.systems.arm.numerics.energy_tank import LEVEL, N_TANK
 from makebreak.systems.arm.numerics.joint_friction import joint_torque
 from makebreak.systems.arm.numerics.serial_chain import chain_state
-from makebreak.systems.numerics.joint_laws import LAWS, JointLaws, law_number
+from makebreak.systems.numerics.joint_laws import (
+    LAWS,
+    N_NUMBERS,
+    JointLaws,
+    law_number,
+    position_law,
+    ripple_law,
+    spring_law,
+)
 
 # A rail, a shoulder, a second rail that leans, an elbow, a wrist.
 JOINTS = [
@@ -222,7 +230,7 @@ def test_a_stiffness_on_the_port_drives_no_swing(frequency, worst):
 
 @given(
     number=st.integers(0, len(LAWS) - 1),
-    p=st.tuples(*[st.floats(0.1, 5.0)] * 4),
+    p=st.tuples(*[st.floats(0.1, 5.0)] * N_NUMBERS),
     q=st.floats(-2.0, 2.0),
     v_d=st.floats(-3.0, 3.0),
 )
@@ -230,10 +238,12 @@ def test_known_forces_of_the_joints_are_taken_off_where_the_reference_is_followe
     number, p, q, v_d
 ):
     p, one = np.array(p), np.zeros(1, np.int64)
+    if LAWS[number] is position_law:
+        p[3] += p[2]  # Above the low position.
     laws = JointLaws(one, np.array([number]), p[None])
     damping = np.array([2.0])
     tau = joint_torque(laws, damping, np.array([q]), np.array([v_d]))
     expected = 2.0 * v_d - law_number(number, q, v_d, 0.0, p)
     np.testing.assert_allclose(tau, expected, rtol=1e-12, atol=1e-12)
-    if number < 4:  # Friction and drag: nothing where the reference rests.
+    if LAWS[number] not in (ripple_law, spring_law):  # Nothing where it rests.
         assert joint_torque(laws, damping, np.array([q]), np.zeros(1))[0] == 0.0

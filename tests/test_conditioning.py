@@ -287,3 +287,63 @@ def test_a_log_with_held_rows_and_jitter_gives_the_names_of_a_clean_one(tmp_path
                 )
     assert names[0] == names[1] and len(names[0]) == 2
     np.testing.assert_allclose(lags, 0.0054, rtol=0.2)
+
+
+def loop_log(folder, row, period, phase, seconds=4.0):
+    """A log with a row each `row` [s] of a loop whose commands change each `period`,
+    with a rest in the middle."""
+    n = int(seconds / row)
+    time = row * np.arange(n)
+    k = np.floor((time - phase) / period + 1e-9)
+    command = np.where((k > 300) & (k < 330), 0.0, np.sin(0.05 * k))
+    position = 0.3 * np.sin(3.0 * time)
+    position += 1e-4 * np.random.default_rng(0).normal(size=n)
+    columns = {"time": time, "a.j.position": position, "a.j.position_command": command}
+    return written(folder, columns), time, command
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.7e-3])
+def test_commands_between_rows_get_rows_at_their_loops_ticks(tmp_path, phase):
+    """Of a loop of 4.7 ms in a log of 2 ms: its changes are known far better than a
+    row."""
+    file, _, _ = loop_log(tmp_path, 2e-3, 4.7e-3, phase)
+    recording = read_recording(file)
+    (out,), found = condition([recording], average=False)
+    assert [f.kind for f in found] == ["command_clock"]
+    u = out.held("a.j.position_command")
+    changed = out.time[1 + np.flatnonzero(np.diff(u) != 0.0)]
+    off = (changed - phase + 1e-6) % 4.7e-3 - 1e-6
+    assert len(changed) > 600 and np.abs(off).max() < 0.2e-3
+    # What was measured stays where it was.
+    there = np.isfinite(out["a.j.position"])
+    np.testing.assert_array_equal(out.time[there], recording.time)
+    for name in ("a.j.position", "a.j.position_command"):
+        np.testing.assert_array_equal(out[name][there], recording[name])
+    assert out.period_sec() == pytest.approx(2e-3)
+
+
+def test_commands_that_change_at_rows_or_anyhow_stay_as_they_are(tmp_path):
+    file, _, _ = loop_log(tmp_path, 2e-3, 8e-3, 0.0)
+    assert condition([read_recording(file)], average=False)[1] == []
+    rng = np.random.default_rng(3)
+    time = 2e-3 * np.arange(2000)
+    events = np.sort(rng.uniform(0.0, 4.0, 700))
+    columns = {
+        "time": time,
+        "a.j.position": 0.1 * rng.normal(size=2000),
+        "a.j.position_command": np.searchsorted(events, time).astype(float),
+    }
+    file = written(tmp_path, columns)
+    assert condition([read_recording(file)], average=False)[1] == []
+
+
+def test_averages_leave_commands_of_a_loop_their_own_rows(tmp_path):
+    """The mean of a block in the place of two commands would act as a weaker drive."""
+    file, time, command = loop_log(tmp_path, 1e-3, 5e-3, 0.0)
+    recording = read_recording(file)
+    (out,), found = condition([recording])
+    assert "averaged" in [f.kind for f in found]
+    u = out.held("a.j.position_command")
+    at = np.searchsorted(out.time, time + 1e-9, "right") - 1
+    last = time < out.time[-1]
+    np.testing.assert_allclose(u[at][last], command[last], rtol=1e-9)

@@ -67,6 +67,8 @@ LACKS = {
         ("joint_load_friction", "p", dict(share=0.4)),
         ("joint_direction_friction", "p.wave",
          dict(coulomb_plus=0.2, coulomb_minus=0.5)),
+        ("joint_position_friction", "p.rail",
+         dict(coulomb_low=3.0, coulomb_high=9.0, low=-0.1, high=0.2)),
         ("joint_quadratic_drag", "p.twist", dict(coefficient=0.1)),
     ],
     "drive": [
@@ -164,7 +166,7 @@ def test_mass_matrix_and_bias_are_those_of_drake(tmp_path):
 
 
 def test_every_law_of_a_joint_is_in_the_compiled_list():
-    q, v, t, p = 0.3, -0.4, 0.1, np.array([0.5, 0.7, 0.2, 0.6])
+    q, v, t, p = 0.3, -0.4, 0.1, np.array([0.5, 0.7, 0.2, 0.6, 0.3])
     for number, law in enumerate(LAWS):
         assert law_number(number, q, v, t, p) == law(q, v, t, p)
     for kind, entry in KINDS.items():

@@ -36,6 +36,10 @@ EXACT = {
         "d.j2",
         dict(coulomb=0.5, static=0.9, stribeck_velocity=0.2),
     ),
+    "joint_position_friction": (
+        "d.j1",
+        dict(coulomb_low=0.3, coulomb_high=0.8, low=-0.3, high=0.4),
+    ),
     "joint_quadratic_drag": ("d", dict(coefficient=0.2)),
     "rotor_inertia": ("d.j1", dict(inertia=0.15)),
     "torque_ripple": ("d.j1", dict(amplitude=0.6, periods_per_rev=5.0, phase=-0.8)),
@@ -55,6 +59,8 @@ GRID = {
     "stribeck_velocity": [0.1, 0.2],
     "periods_per_rev": [4, 5],
     "frequency": [1.0, 1.5],
+    "low": [-0.3],
+    "high": [0.4],
 }
 # Linearised: small, and the error goes with the square.
 SMALL = {

@@ -34,6 +34,10 @@ CASES = {
         dict(coulomb=0.3, static=0.6, stribeck_velocity=0.5),
         lambda q, v: -(0.3 + 0.3 * np.exp(-((v / 0.5) ** 2))) * np.tanh(v / FADE),
     ),
+    "joint_position_friction": (
+        dict(coulomb_low=0.6, coulomb_high=0.2, low=-0.4, high=0.7),
+        lambda q, v: -np.interp(q, [-0.4, 0.7], [0.6, 0.2]) * np.tanh(v / FADE),
+    ),
     "joint_quadratic_drag": (dict(coefficient=0.2), lambda q, v: -0.2 * v * abs(v)),
     "torque_ripple": (
         dict(amplitude=0.8, periods_per_rev=7.0, phase=0.4),

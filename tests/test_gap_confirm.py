@@ -109,6 +109,14 @@ def test_one_joint_of_a_group_goes_and_the_others_stay():
     assert choice.effect.at == ["arm.j2"] and "from 4.8 to 8.6" in why
 
 
+def test_what_closes_half_of_its_own_joints_gap_is_confirmed_beside_a_larger_one():
+    problem = Held({"arm.j1": (9.0, 1.0), "arm.j2": (20.0, 19.0), "arm.j3": (9.0, 8.0)})
+    found = confirm(problem, selection_of(problem))
+    assert found.outcome.gap.reduction < 0.5
+    assert [e.at for e in found.selection.effects()] == [["arm.j1"]]
+    assert [c.effect.at for c, _ in found.vetoed] == [["arm.j2"], ["arm.j3"]]
+
+
 @pytest.mark.parametrize("others, gone", [(2.0, ["arm.j2"]), (18.0, [])])
 def test_of_a_group_goes_what_is_needless_unless_other_joints_are_worse_without(
     others, gone

@@ -737,7 +737,7 @@ def test_a_patch_s_side_that_nothing_crossed_may_be_anywhere():
     [(0.9, 0.8, True), (0.9, 2.1, False), (8.0, 2.0, True), (8.0, 5.0, False)],
 )
 def test_effects_that_make_a_gap_in_simulation_are_not_confirmed(before, after, good):
-    assert confirm.is_confirmed(GapMeasure(before, after, 1.0, 0.6)) == good
+    assert confirm.is_confirmed(GapMeasure(before, after, 1.0, 0.6), bool) == good
 
 
 def test_a_signal_that_jumps_between_samples_is_known_less_well():

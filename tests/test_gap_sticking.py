@@ -138,6 +138,20 @@ HIDDEN = {
 
 
 @pytest.mark.slow
+def test_friction_that_changes_with_the_position_is_named(tmp_path):
+    truth = dict(coulomb_low=2.0, coulomb_high=0.4, low=-0.3, high=0.3)
+    hidden = [("joint_position_friction", ["d.j2"], truth)]
+    (choice,) = select(problem_of(tmp_path, "two", hidden)).choices
+    effect = choice.effect
+    assert (effect.kind, list(effect.at)) == ("joint_position_friction", ["d.j2"])
+    # The ends are those of the motion.
+    p = effect.parameters
+    expected = np.interp([p["low"], p["high"]], [-0.3, 0.3], [2.0, 0.4])
+    found = [p["coulomb_low"], p["coulomb_high"]]
+    np.testing.assert_allclose(found, expected, atol=0.15)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("arm", HIDDEN)
 def test_what_all_joints_have_is_named_with_a_value_for_each(tmp_path, arm):
     problem = problem_of(tmp_path, arm, HIDDEN[arm])

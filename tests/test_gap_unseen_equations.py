@@ -121,7 +121,7 @@ def test_recordings_that_are_too_short_tell_nothing(pushes):
 )
 def test_equations_confirm_what_windows_do_not_show(windows, equations, good):
     gap = GapMeasure(*windows, 1.0, 0.6, in_equations=equations)
-    assert confirm.is_confirmed(gap) == good
+    assert confirm.is_confirmed(gap, bool) == good
 
 
 def test_what_is_not_confirmed_is_said_with_the_figures_that_say_so():

@@ -12,7 +12,7 @@ from makebreak.systems.arm.numerics.impedance_controller import (
 )
 from makebreak.systems.arm.numerics.packed import packed
 from makebreak.systems.arm.numerics.serial_chain import SerialChain, chain_of
-from makebreak.systems.numerics.joint_laws import JointLaws
+from makebreak.systems.numerics.joint_laws import N_NUMBERS, JointLaws
 
 
 def chain_and_law(n, m):
@@ -24,7 +24,7 @@ def chain_and_law(n, m):
     )
     arrays = (rng.uniform(0.5, 1.5, s) for s in (*6 * [(n,)], (3, 3), (6,), (6,)))
     numbers = (*rng.uniform(0.5, 1.5, 4), 12, bool(n % 2), *rng.uniform(0.5, 1.5, 1))
-    laws = JointLaws(*rng.integers(0, 6, (2, m)), rng.uniform(0.5, 1.5, (m, 4)))
+    laws = JointLaws(*rng.integers(0, 6, (2, m)), rng.uniform(0.5, 1.5, (m, N_NUMBERS)))
     return chain, Law(*arrays, *numbers, ForceLaw(*rng.uniform(0.5, 1.5, 7)), laws)
 
 

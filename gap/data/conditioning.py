@@ -14,6 +14,7 @@ import numpy as np
 
 from makebreak.gap.data.channel_noise import with_noise
 from makebreak.gap.data.clock import clock_period, even_clock
+from makebreak.gap.data.command_clock import on_command_clock
 from makebreak.gap.data.filters import FILTERED_SEC
 from makebreak.gap.data.findings import Finding
 from makebreak.gap.data.recording import Channel, Episode, Recording, unit_of
@@ -29,6 +30,7 @@ from makebreak.systems.numerics.smoother import smooth_filtered
 # shorter than a period of the fastest motion.
 BLOCK_SEC, BLOCK_ROWS, PER_PERIOD = 0.01, 4, 10.0
 BAND_SHARE = 0.99  # Of the acceleration's power, that lies below the fastest motion.
+RARE = 0.5  # A command that changes in a smaller share of the rows keeps its own.
 HELD_SHARE = 2e-3  # Fewer repeated rows are chance, or rest.
 LONGEST_HOLD_SEC = 0.05  # What stays the same for longer stands still.
 ENDS_SEC = 0.2  # Of an episode, where rates are not known well.
@@ -45,7 +47,8 @@ def condition(
     out, found = [], []
     for recording in recordings:
         for step in (
-            _without_held, _on_even_clock, _averaged, _with_jitter, _beside_positions,
+            _without_held, _on_even_clock, on_command_clock, _averaged, _with_jitter,
+            _beside_positions,
         ):  # fmt: skip
             if step is _averaged and not average:
                 continue
@@ -185,7 +188,8 @@ def _averaged(recording: Recording) -> tuple[Recording, list[Finding]]:
     """Means over blocks of time, of a log that is much faster than its motion.
 
     Commands get the row of their block's start, from which they hold, and measured
-    channels that of its middle. Slower channels keep their own rows.
+    channels that of its middle. Slower channels keep their own rows, commands of loops
+    those at which they change.
     """
     period = recording.period_sec()
     fastest = max(
@@ -284,11 +288,18 @@ def _blocks(recording: Recording, episode: Episode, length: float, fast):
     starts = time[0] + length * np.arange(n)
     middles = starts + 0.5 * length
     block = np.minimum(((time - time[0]) / length).astype(int), n)
-    has_commands = any(c.is_command for c in recording.channels.values())
     slow = [
         c for c in recording.measured() if c.name not in fast
     ]  # Each at its own stamps.
-    rows = [middles, *([starts] if has_commands else [])]
+    held = {c.name: recording.held(c.name)[episode.rows] for c in recording.commands()}
+    changed = {name: _changes(x) & (block < n) for name, x in held.items()}
+    # (What an effort does follows from its mean; a loop's gains would seem smaller.)
+    rare = {
+        name for name, x in changed.items()
+        if np.mean(x) < RARE and not name.endswith(".effort_command")
+    }  # fmt: skip
+    rows = [middles, *([starts] if len(rare) < len(held) else [])]
+    rows += [time[changed[name]] for name in rare]
     for channel in slow:
         rows.append(time[np.isfinite(channel.values[episode.rows]) & (block < n)])
     every = np.unique(np.concatenate(rows))
@@ -297,9 +308,11 @@ def _blocks(recording: Recording, episode: Episode, length: float, fast):
     out = {"time": every, "row": recording.row[episode.rows][np.maximum(first, 0)]}
     for name, channel in recording.channels.items():
         y, column = channel.values[episode.rows], np.full(len(every), np.nan)
-        if channel.is_command:
-            held = recording.held(name)[episode.rows]
-            column[at_start] = _mean_of_held(time, held, starts, length)
+        if name in rare:
+            at = changed[name]
+            column[np.searchsorted(every, time[at])] = held[name][at]
+        elif channel.is_command:
+            column[at_start] = _mean_of_held(time, held[name], starts, length)
         elif name in fast:
             there = np.isfinite(y) & (block < n)
             column[at_middle] = _mean_at_middle(
@@ -310,6 +323,12 @@ def _blocks(recording: Recording, episode: Episode, length: float, fast):
             column[np.searchsorted(every, time[there])] = y[there]
         out[name] = column
     return out
+
+
+def _changes(held: np.ndarray) -> np.ndarray:
+    """(n,) whether a command is another one than in the row before."""
+    before = np.concatenate([[np.nan], held[:-1]])
+    return np.isfinite(held) & (held != before)
 
 
 def _mean_of_held(time, held, starts, length) -> np.ndarray:

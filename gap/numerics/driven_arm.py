@@ -52,7 +52,7 @@ class DrivenArm(NamedTuple):
     most: np.ndarray  # (n,) what the joint takes at most.
     law_joint: np.ndarray  # (m,) int: the joint of each further force,
     law_kind: np.ndarray  # (m,) int: its number in joint_laws.LAWS,
-    law_p: np.ndarray  # (m, 4) and its numbers.
+    law_p: np.ndarray  # (m, 5) and its numbers.
 
 
 def rollout(arm: DrivenArm, q, v, times, commands, tol: float = 1e-3) -> np.ndarray:

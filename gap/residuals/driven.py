@@ -7,7 +7,7 @@ motion mislead. Here windows are simulated by compiled code
 would do is seen by differences.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -44,6 +44,7 @@ from makebreak.gap.residuals.mechanism_candidates import (
     NUISANCE_LIMIT,
     loads,
     tolerances,
+    values_tried,
 )
 from makebreak.gap.residuals.objects import unexplained_in_windows
 from makebreak.gap.residuals.where import where_in_windows
@@ -54,7 +55,13 @@ from makebreak.gap.simulation.windows import LARGEST, WindowModel
 from makebreak.models.drives import DRIVEN_BY, law_of
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.joints import rotor
-from makebreak.models.effects.kind import Effect
+from makebreak.models.effects.kind import (
+    Effect,
+    Parameter,
+    full_name,
+    one_dof_joints,
+)
+from makebreak.models.effects.signature import Motion
 from makebreak.models.scene import Scene
 from makebreak.models.scene_schema import COMMANDS_OF
 
@@ -272,15 +279,13 @@ class DrivenProblem(DrivenWindows, GapProblem):
         for e in effects:
             if KINDS[e.kind].at not in JOINTS or "." not in e.at[0]:
                 continue
-            if len(e.parameters) != 1:
-                continue
-            ((name, value),) = e.parameters.items()
-            unit = KINDS[e.kind].parameter(name).unit
-            for joint in e.at:
-                now = self.dynamics.now(e.kind, [joint]).get(name, np.inf)
-                if unit in RICH and now < 1e20:
-                    size = self._step(unit, now, joint) / STEP_OF_PRIOR
-                    rows.append((value - now) / size)
+            for name, value in e.parameters.items():
+                unit = KINDS[e.kind].parameter(name).unit
+                for joint in e.at:
+                    now = self.dynamics.now(e.kind, [joint]).get(name, np.inf)
+                    if unit in RICH and now < 1e20:
+                        size = self._step(unit, now, joint) / STEP_OF_PRIOR
+                        rows.append((value - now) / size)
         return np.array(rows)
 
     def _independent(self) -> list[Effect]:
@@ -289,11 +294,7 @@ class DrivenProblem(DrivenWindows, GapProblem):
         found: list[Effect] = []
         basis: dict[str, np.ndarray] = {}
         base = self.base()
-        for kind, name, each in self._at_joints():
-            if KINDS[kind].channel or KINDS[kind].parameter(name).unit not in RICH:
-                continue
-            moved = {joint: x + step for joint, (x, step) in each.items() if step}
-            small = [Effect(kind, [j], {name: x}) for j, x in moved.items()]
+        for small in [*self._small(), *self._small_between()]:
             try:
                 off = self.residual(small) - base
             except ValueError:
@@ -307,6 +308,44 @@ class DrivenProblem(DrivenWindows, GapProblem):
                 if size > OWN * float(np.linalg.norm(x)):
                     basis[joint] = np.column_stack([known, rest / size])
                     found.append(effect)
+        return found
+
+    def _small(self) -> Iterator[list[Effect]]:
+        """Of each kind with one parameter, small effects at all joints."""
+        for kind, name, each in self._at_joints():
+            if KINDS[kind].channel or KINDS[kind].parameter(name).unit not in RICH:
+                continue
+            moved = {joint: x + step for joint, (x, step) in each.items() if step}
+            yield [Effect(kind, [j], {name: x}) for j, x in moved.items()]
+
+    def _small_between(self) -> Iterator[list[Effect]]:
+        """The same of kinds that change with what the motion gives: small where the
+        first of their parameters holds."""
+        motions = self._motions()
+        for kind, entry in KINDS.items():
+            names = [p.name for p in entry.parameters if not p.given]
+            if len(names) == len(entry.parameters) or entry.at not in JOINTS:
+                continue
+            small = []
+            for joint in self.dynamics.places(kind):
+                for held in values_tried(kind, joint, self.dynamics.plant, motions):
+                    p = dict.fromkeys(names, 0.0) | held
+                    unit = entry.parameter(names[0]).unit
+                    p[names[0]] = self._step(unit, 0.0, joint)
+                    small.append(Effect(kind, [joint], p))
+            yield small
+
+    def _motions(self) -> list[Motion]:
+        """The smoothed motion of each episode."""
+        plant, found = self.dynamics.plant, []
+        for path in self._paths.values():
+            x = np.zeros((3, len(path["time"]), plant.num_velocities()))
+            for joint in one_dof_joints(plant):
+                name = f"{full_name(plant, joint)}.position"
+                if name in path and joint.num_velocities():
+                    x[:, :, joint.velocity_start()] = path[name].T
+            q, v, vd = x
+            found.append(Motion(path["time"], q, v, vd, np.zeros_like(q)))
         return found
 
     def _misfit_of(self, left: np.ndarray) -> np.ndarray:
@@ -662,18 +701,22 @@ class DrivenProblem(DrivenWindows, GapProblem):
     def is_within_tolerance(self, effect: Effect) -> bool:
         """Drives keep time, and friction reverses, as well as laws say it: to 1 % of a
         joint's inertia and of its effort. Of a gain, what its own tolerance may be."""
-        kind, at = effect.kind, effect.at[0]
-        if KINDS[kind].at not in JOINTS or len(effect.parameters) != 1:
+        entry, at = KINDS[effect.kind], effect.at[0]
+        if entry.at not in JOINTS:
             return False
         joint = at if "." in at else self.joints[0]
-        ((name, value),) = effect.parameters.items()
-        now = self.dynamics.now(kind, [joint]).get(name, np.inf)
-        if not now < 1e20:
-            return False
-        if KINDS[kind].drive == "kp":
-            return abs(value - now) < NUISANCE_LIMIT * gains_known_to(self.scene) * now
-        size = abs(self._step(KINDS[kind].parameter(name).unit, now, joint))
-        return abs(value - now) < LAW * size
+        has = self.dynamics.now(effect.kind, [joint])
+
+        def is_within(parameter: Parameter) -> bool:
+            now = has.get(parameter.name, np.inf)
+            off = abs(effect.parameters.get(parameter.name, now) - now)
+            if entry.drive == "kp":
+                return off < NUISANCE_LIMIT * gains_known_to(self.scene) * now
+            return now < 1e20 and off < LAW * abs(
+                self._step(parameter.unit, now, joint)
+            )
+
+        return all(is_within(p) for p in entry.parameters if not p.given)
 
     def parts(self) -> np.ndarray:
         return self._by_row([w.recording for w in self.windows])

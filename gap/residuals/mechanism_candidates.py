@@ -102,7 +102,10 @@ def candidates(
             if at == unit and _is_mass_alone(kind):
                 continue
             columns, readers = [], []
-            grids = _grids(model, kind, at, motions)
+            grids = [
+                {name: [value] for name, value in tried.items()} or None
+                for tried in values_tried(kind, at, dynamics.plant, motions)
+            ]
             if is_wave:
                 grids = waves if waves is not None else grids
             # One value of a grid after the other: all at once would be gigabytes.
@@ -124,7 +127,7 @@ def candidates(
                 waves = [grids[k] for k in best]
                 columns = [columns[k] for k in best]
                 readers = [readers[k] for k in best]
-            size = sum(not p.optional for p in entry.parameters)
+            size = sum(not (p.optional or p.given) for p in entry.parameters)
             if entry.may_lack:
                 kept = [
                     k for k, p in enumerate(entry.parameters)
@@ -310,13 +313,16 @@ def _some_of(reader: Callable, kept: Sequence[int], n: int) -> Callable:
     return read
 
 
-def _grids(model: InverseModel, kind: str, at: str, motions) -> list:
+def values_tried(kind: str, at: str, plant, motions) -> list[dict[str, float]]:
+    """The nonlinear parameters that a search tries, one set after the other."""
     tries = KINDS[kind].tries
     if tries is None:
-        return [None]
-    grid = tries(Effect(kind, [at], {}), model.dynamics.plant, motions)
-    ((name, values),) = grid.items()
-    return [{name: [value]} for value in values]
+        return [{}]
+    grid = tries(Effect(kind, [at], {}), plant, motions)
+    return [
+        dict(zip(grid, values, strict=True))
+        for values in zip(*grid.values(), strict=True)
+    ]
 
 
 def _of_delays(model: InverseModel, kind: str) -> list[Candidate]:

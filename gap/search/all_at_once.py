@@ -13,6 +13,7 @@ from makebreak.gap.problem import Fitted, rms
 from makebreak.gap.search.choice import Choice, refreshed
 from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.thresholds import SAME_ERROR
+from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 
 
@@ -35,6 +36,8 @@ def all_at_once(search: Comparison) -> tuple[list[Choice], Fitted]:
     most = (1.0 + SAME_ERROR) * _errors(search, fit)
     for kind in reversed(list(dict.fromkeys(e.kind for e in every))):
         fit = _without(search, fit, kind, most)
+        if KINDS[kind].contains:
+            fit = _in_place_of_contained(search, fit, kind, most)
     some = [e for e in fit.effects if not problem.is_within_tolerance(e)]
     fit = _fit(search, some, alone=False) if some else None
     if fit is None:
@@ -42,8 +45,8 @@ def all_at_once(search: Comparison) -> tuple[list[Choice], Fitted]:
     search.say(f"  {len(fit.effects)} of {len(every)} effects at once: {fit.score:.3g}")
     before = search.start.score
     choices = [
-        Choice(e, {}, before, fit.score, "", np.inf, (), (), 1, in_group=True)
-        for e in fit.effects
+        Choice(e, {}, before, fit.score, "", np.inf, (), (), len(std), in_group=True)
+        for e, std in zip(fit.effects, fit.std, strict=True)
     ]
     return refreshed(choices, fit), fit
 
@@ -78,6 +81,19 @@ def _without(search: Comparison, fit: Fitted, kind: str, most: np.ndarray) -> Fi
         }  # fmt: skip
         # Where a joint is worse by what another one lacks, all of them stay.
         kept |= needed or {tuple(e.at) for e in gone}
+
+
+def _in_place_of_contained(
+    search: Comparison, fit: Fitted, kind: str, most: np.ndarray
+) -> Fitted:
+    """Where effects of a kind stay, those that it contains go: it says both."""
+    at = {tuple(e.at) for e in fit.effects if e.kind == kind}
+    inside = KINDS[kind].contains
+    some = [e for e in fit.effects if not (e.kind in inside and tuple(e.at) in at)]
+    if len(some) == len(fit.effects):
+        return fit
+    less = _fit(search, some)
+    return fit if less is None or (_errors(search, less) > most).any() else less
 
 
 def _fit(

@@ -11,7 +11,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Joint
 from pydrake.systems.framework import BasicVector, LeafSystem
 
-MAX_NUMBERS = 4  # Numbers p of one law.
+from makebreak.systems.numerics.joint_laws import N_NUMBERS
 
 
 class JointForces(LeafSystem):
@@ -23,7 +23,7 @@ class JointForces(LeafSystem):
     The numbers p of all laws are numeric parameter 0 of the Context.
 
     Args: laws: compiled functions; joints: the one-dof joint of each law; numbers: p of
-        each law, up to four.
+        each law, at most N_NUMBERS.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class JointForces(LeafSystem):
         self._numbers = self.DeclareNumericParameter(BasicVector(_padded(numbers)))
         self.DeclareVectorOutputPort("generalized_force", self._n_v, self._calc)
         for law in set(laws):
-            law(0.0, 0.0, 0.0, np.ones(MAX_NUMBERS))  # Compile it now.
+            law(0.0, 0.0, 0.0, np.arange(1.0, 1.0 + N_NUMBERS))  # Compile it now.
 
     def set_numbers(self, context, numbers: Sequence[Sequence[float]]) -> None:
         """New numbers p of all laws, in a Context of this system."""
@@ -62,12 +62,12 @@ class JointForces(LeafSystem):
         """(n_v,) at a state [q, v]; p (4 n_laws,)."""
         tau = np.zeros(self._n_v)
         for i, (law, i_q, i_x, i_v) in enumerate(self._laws):
-            tau[i_v] += law(x[i_q], x[i_x], time, p[MAX_NUMBERS * i :])
+            tau[i_v] += law(x[i_q], x[i_x], time, p[N_NUMBERS * i :])
         return tau
 
 
 def _padded(numbers) -> np.ndarray:
-    flat = np.zeros((len(numbers), MAX_NUMBERS))
+    flat = np.zeros((len(numbers), N_NUMBERS))
     for i, each in enumerate(numbers):
         flat[i, : len(each)] = each
     return flat.ravel()

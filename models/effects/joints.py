@@ -26,6 +26,7 @@ from makebreak.systems.numerics.joint_laws import (
     coulomb_law,
     direction_law,
     drag_law,
+    position_law,
     ripple_law,
     spring_law,
     stribeck_law,
@@ -176,6 +177,29 @@ def _stribeck_numbers(effect, plant, joint):
     return [p["coulomb"], p["static"], p["stribeck_velocity"], fade]
 
 
+def _position_numbers(effect, plant, joint):
+    p = effect.parameters
+    c = [p[name] for name in ("coulomb_low", "coulomb_high")]
+    return [*c, p["low"], p["high"], fade_velocity(plant, joint, max(c))]
+
+
+def _check_range(effect: Effect) -> None:
+    p = effect.parameters
+    if not p["low"] < p["high"]:
+        raise ValueError(
+            f"effect {effect.kind} at {effect.at}: low is {p['low']:g} and high "
+            f"{p['high']:g}, expected low below high"
+        )
+
+
+def _range_of(effect, plant, motions) -> dict[str, list[float]]:
+    """Between which positions a joint is for nine tenths of the time."""
+    (joint,) = find_joints(effect, plant)
+    q = np.concatenate([m.q[:, joint.position_start()] for m in motions])
+    low, high = (float(x) for x in np.quantile(q, (0.05, 0.95)))
+    return {"low": [low], "high": [high]} if low < high else {"low": [], "high": []}
+
+
 def _numbers(*names):
     return lambda effect, plant, joint: [effect.parameters[name] for name in names]
 
@@ -227,6 +251,26 @@ def _stribeck_signature(effect, model, motion, grid=None) -> list[Signature]:
         ]
         held = {"stribeck_velocity": v_s}
         names = ["coulomb", "static"]
+        found.append(at_joints(effect, names, motion, joints, entries, held))
+    return found
+
+
+def _position_signature(effect, model, motion, grid=None) -> list[Signature]:
+    joints = find_joints(effect, model.plant)
+    slow = velocity_unit(joints[0])
+    if not grid or "low" not in grid:
+        grid = _range_of(effect, model.plant, [motion])
+    found = []
+    for low, high in zip(grid["low"], grid["high"], strict=True):
+
+        def share(q, low=low, high=high):
+            return np.clip((q - low) / (high - low), 0.0, 1.0)
+
+        entries = [
+            lambda q, v, u, share=share: (1.0 - share(q)) * np.tanh(v / slow),
+            lambda q, v, u, share=share: share(q) * np.tanh(v / slow),
+        ]
+        names, held = ["coulomb_low", "coulomb_high"], {"low": low, "high": high}
         found.append(at_joints(effect, names, motion, joints, entries, held))
     return found
 
@@ -370,6 +414,7 @@ KINDS = {
         confused_with=(
             "joint_viscous_damping",
             "joint_stribeck_friction",
+            "joint_position_friction",
             "actuator_bias",
             "joint_backlash",
         ),
@@ -401,6 +446,30 @@ KINDS = {
         joint_law=direction_law,
         joint_numbers=_direction_numbers,
         signature=_direction_signature,
+    ),
+    "joint_position_friction": EffectKind(
+        at="joint",
+        parameters=(
+            Parameter("coulomb_low", "N m", 0.0, 50.0, valid=">= 0"),
+            Parameter("coulomb_high", "N m", 0.0, 50.0, valid=">= 0"),
+            Parameter("low", "rad", -1e3, 1e3, None, given=True),
+            Parameter("high", "rad", -1e3, 1e3, None, given=True),
+        ),
+        says="{at} has Coulomb friction that the model lacks: {coulomb_low} at {low}, "
+        "{coulomb_high} at {high}, linear between",
+        confused_with=(
+            "joint_coulomb_friction",
+            "joint_load_friction",
+            "joint_spring",
+        ),
+        contains=("joint_coulomb_friction",),
+        tries=_range_of,
+        tell_apart="move the joint both ways through its whole range, at one speed, in "
+        "several poses of the other joints",
+        check=_check_range,
+        joint_law=position_law,
+        joint_numbers=_position_numbers,
+        signature=_position_signature,
     ),
     "joint_load_friction": EffectKind(
         at="actuator",

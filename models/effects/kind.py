@@ -56,6 +56,8 @@ class Parameter:
     rough: its effect is discontinuous, so a fit tries values instead of gradients.
     endless: values beyond low and high have the same effect as these, and are allowed.
     ends: a fit does not go above high, where other parameters could compensate it.
+    given: it says where the others hold: a search takes it from the motion, and a fit
+        leaves it.
     refines: optional, and added by a search to an effect that is named without it,
         where that earns its place.
     """
@@ -71,6 +73,7 @@ class Parameter:
     endless: bool = False
     ends: bool = False
     refines: bool = False
+    given: bool = False
 
     @property
     def most(self) -> float:
@@ -133,7 +136,7 @@ class EffectKind:
     after_finalize(effect, plant, scene_graph, builder): adds systems; returns a port of
         generalized forces (n_v,) on the plant.
     joint_law: compiled (q, v, t, p) -> force of the effect on the joint [N m] or [N];
-        joint_numbers(effect, plant, joint) -> p, up to four numbers.
+        joint_numbers(effect, plant, joint) -> p, up to five numbers.
     body_law: compiled (V_WB (6,), t, p, F (6,)): adds to F the spatial force on the
         body at its origin, torque first; body_numbers(effect) -> p.
     path: its step between command and plant: a key of actuation_path.STEPS.

@@ -1,7 +1,7 @@
 """Forces on one joint that depend on its own position and velocity, compiled.
 
 Each law (q, v, t, p) gives the force on the joint [N m] or [N] from its position,
-velocity, the time and up to four parameters p.
+velocity, the time and up to five parameters p.
 """
 
 import math
@@ -49,10 +49,22 @@ def spring_law(q, v, t, p):
     return -p[0] * (q - p[1])
 
 
-LAWS = (coulomb_law, direction_law, stribeck_law, drag_law, ripple_law, spring_law)
+@numba.njit(cache=True)
+def position_law(q, v, t, p):
+    """p: Coulomb friction at a low and at a high position, these positions, speed below
+    which it fades; linear between them and constant beyond."""
+    share = min(max((q - p[2]) / (p[3] - p[2]), 0.0), 1.0)
+    return -(p[0] + share * (p[1] - p[0])) * math.tanh(v / p[4])
+
+
+LAWS = (
+    coulomb_law, direction_law, stribeck_law, drag_law, ripple_law, spring_law,
+    position_law,
+)  # fmt: skip
+N_NUMBERS = 5  # Of p.
 # Where in p the speed is below which a law of dry friction fades; what is before it are
-# its frictions, and a Stribeck velocity.
-FADES_AT = {0: 1, 1: 2, 2: 3}
+# its frictions, and a Stribeck velocity or positions.
+FADES_AT = {0: 1, 1: 2, 2: 3, 6: 4}
 
 
 @numba.njit(cache=True)
@@ -68,6 +80,8 @@ def law_number(number, q, v, t, p):
         return drag_law(q, v, t, p)
     if number == 4:
         return ripple_law(q, v, t, p)
+    if number == 6:
+        return position_law(q, v, t, p)
     return spring_law(q, v, t, p)
 
 
@@ -76,4 +90,4 @@ class JointLaws(NamedTuple):
 
     joint: np.ndarray  # (m,) int: index of the joint's position and velocity.
     kind: np.ndarray  # (m,) int: number in LAWS.
-    p: np.ndarray  # (m, 4)
+    p: np.ndarray  # (m, N_NUMBERS)

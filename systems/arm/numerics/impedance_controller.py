@@ -39,7 +39,7 @@ from makebreak.systems.arm.numerics.serial_chain import (
     chain_state,
     tip_kinematics,
 )
-from makebreak.systems.numerics.joint_laws import JointLaws
+from makebreak.systems.numerics.joint_laws import N_NUMBERS, JointLaws
 
 # Status bits.
 REFERENCE_HELD = 1
@@ -160,7 +160,9 @@ def law_of(flat):
             numbers[13],
         ),
         JointLaws(
-            joint.astype(np.int64), kind.astype(np.int64), p.reshape((joint.size, 4))
+            joint.astype(np.int64),
+            kind.astype(np.int64),
+            p.reshape((joint.size, N_NUMBERS)),
         ),
     )
 

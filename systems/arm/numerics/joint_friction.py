@@ -17,11 +17,11 @@ section 4, on compensation by the reference's velocity.
 import numba
 import numpy as np
 
-from makebreak.systems.numerics.joint_laws import JointLaws, law_number
+from makebreak.systems.numerics.joint_laws import N_NUMBERS, JointLaws, law_number
 
 # A law without force: no array of a packed law may be empty.
 NO_LAWS = JointLaws(
-    np.zeros(1, np.int64), np.zeros(1, np.int64), np.array([[0.0, 1.0, 0.0, 0.0]])
+    np.zeros(1, np.int64), np.zeros(1, np.int64), np.eye(1, N_NUMBERS, 1)
 )
 
 

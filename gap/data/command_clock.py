@@ -1,0 +1,138 @@
+"""When commands changed that a slower or uneven table shows only at its next row.
+
+A loop at 200 Hz in a table of 500 Hz changes its commands 2 or 3 rows apart, and each
+change is seen up to a row late. Where all changes fit one even clock between the rows
+at which they were not there yet and those at which they were, they happened at its
+ticks, and get rows of their own there.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.optimize import linprog
+
+from makebreak.gap.data.findings import Finding
+from makebreak.gap.data.recording import Episode, Recording
+
+FEWEST = 20  # Changes that tell a clock.
+SLACK = 0.05  # Of a row: by how much stamps may be off.
+MOVED = 0.05  # Of a row: what is less, on average, needs no rows.
+_ROUNDS = 4
+
+
+def on_command_clock(recording: Recording) -> tuple[Recording, list[Finding]]:
+    """The recording with a row at each instant at which a command changed between rows,
+    and what was done."""
+    commands = recording.commands()
+    quantities = dict.fromkeys(c.quantity for c in commands)
+    one, found = _on_clock_of(recording, [c.name for c in commands])
+    if found or len(quantities) < 2:
+        return one, found
+    for each in quantities:  # They may have a clock each.
+        names = [c.name for c in commands if c.quantity == each]
+        recording, more = _on_clock_of(recording, names)
+        found += more
+    return recording, found
+
+
+def _on_clock_of(
+    recording: Recording, names: Sequence[str]
+) -> tuple[Recording, list[Finding]]:
+    """The same of commands that change together."""
+    instants = [_instants(recording, e, names) for e in recording.episodes]
+    known = [x for x in instants if x is not None]
+    row = recording.period_sec()
+    late = np.concatenate([np.zeros(0), *(at - sooner for at, sooner in known)])
+    if not np.sum(late) > MOVED * row * len(late):
+        return recording, []
+    period = float(np.median(np.concatenate([np.diff(t) for _, t in known])))
+    says = (
+        f"The commands of {recording.path.name} change every {1e3 * period:.4g} ms or "
+        f"a multiple of it, and its rows, {1e3 * row:.3g} ms apart, show that up to "
+        f"{1e3 * late.max():.2g} ms late: they get rows of their own."
+    )
+    name = recording.name
+    finding = Finding("command_clock", name, "time", period, "s", "info", says)
+    return _with_rows(recording, names, instants), [finding]
+
+
+def ticks(before: np.ndarray, after: np.ndarray) -> np.ndarray | None:
+    """The latest ticks (n,) of an even clock, one in each interval (before, after] (n,)
+    [s]; None if there is no such clock. Ticks at which nothing changed are allowed."""
+    if len(after) < FEWEST:
+        return None
+    row = float(np.median(after - before))
+    gap = np.diff(after)
+    usual = float(np.median(gap))
+    period = float(np.mean(gap[np.abs(gap - usual) < 1.01 * row]))
+    middle = 0.5 * (before + after)
+    k = np.concatenate([[0.0], np.cumsum(np.round(gap / period))])
+    for _ in range(_ROUNDS):
+        (period, phase) = np.polyfit(k, middle, 1)
+        if not period > row * (1.0 + SLACK):  # As fast as the rows: nothing shows.
+            return None
+        k = np.round((middle - phase) / period)
+    if (np.diff(k) < 0.5).any():
+        return None
+    # phase + period k <= after + slack, >= before - slack, of times from the first on.
+    n, start = len(k), after[0]
+    one, k = np.ones(n), k - k[0]
+    A = np.block([[one[:, None], k[:, None], -one[:, None]],
+                  [-one[:, None], -k[:, None], -one[:, None]]])  # fmt: skip
+    b = np.concatenate([after - start, start - before])
+    free = [(None, None), (0.0, None)]
+    tight = linprog([0.0, 0.0, 1.0], A, b, bounds=[*free, (0.0, None)])
+    if tight.status != 0 or tight.x[2] > SLACK * row:
+        return None
+    slack = tight.x[2] + 1e-6 * row
+    latest = linprog([-n, -k.sum(), 0.0], A, b, bounds=[*free, (slack, slack)])
+    if latest.status != 0:
+        return None
+    return np.minimum(start + latest.x[0] + latest.x[1] * k, after)
+
+
+def _instants(recording: Recording, episode: Episode, names: Sequence[str]):
+    """(the rows' times at which commands changed, when they did) (n,) each; None where
+    that is not known better."""
+    time = recording.time[episode.rows]
+    if not names or len(time) < 3:
+        return None
+    held = np.stack([recording.held(name)[episode.rows] for name in names], axis=1)
+    changed = 1 + np.flatnonzero((np.diff(held, axis=0) != 0.0).any(axis=1))
+    found = ticks(time[changed - 1], time[changed])
+    return None if found is None else (time[changed], found)
+
+
+def _with_rows(recording: Recording, names: Sequence[str], instants) -> Recording:
+    """The recording with rows of these commands alone at the instants at which they
+    changed."""
+    times, rows, episodes, own = [], [], [], []
+    first = 0
+    for episode, found in zip(recording.episodes, instants, strict=True):
+        time = recording.time[episode.rows]
+        at, sooner = (np.zeros(0), np.zeros(0)) if found is None else found
+        new = at - sooner > 1e-6 * recording.period_sec()
+        every = np.concatenate([time, sooner[new]])
+        shown = np.concatenate(
+            [np.arange(len(time)), np.searchsorted(time, at[new])]
+        )  # The row that has a new row's commands.
+        order = np.argsort(every, kind="stable")
+        times.append(every[order])
+        rows.append(episode.first + shown[order])
+        own.append(order < len(time))
+        episodes.append(replace(episode, first=first, last=first + len(every)))
+        first += len(every)
+    shown, measured = np.concatenate(rows), np.concatenate(own)
+    moved = {}
+    for name, channel in recording.channels.items():
+        if name in names:
+            values = recording.held(name)[shown]
+        else:
+            values = np.where(measured, channel.values[shown], np.nan)
+        values.setflags(write=False)
+        moved[name] = replace(channel, values=values)
+    return replace(
+        recording, time=np.concatenate(times), row=recording.row[shown],
+        episodes=tuple(episodes), channels=moved, raw_period_sec=recording.period_sec(),
+    )  # fmt: skip
