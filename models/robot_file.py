@@ -164,6 +164,8 @@ def _of_document(document: Any, path: Path, suffix: str, packages) -> RobotFile:
         notes += _cleaned_transmissions(document) + _without_commas(document)
         notes += _without_empty_limits(document)
         _clean_materials(document)
+    else:
+        notes += _without_bullets_own(document)
     effects, more = _of_joints(document)
     limits, passive = _drives(document)
     return RobotFile(
@@ -386,6 +388,33 @@ def _without_empty_limits(document: minidom.Document) -> list[str]:
                 f"an upper one of {high:g}: it is taken to have none"
             )
     return notes
+
+
+# Elements of (parent), and attributes, that PyBullet has and SDF does not.
+_BULLETS = (("link", "contact"), ("collision", "material"))
+_BULLETS_MARKS = (("collision", "concave"),)
+
+
+def _without_bullets_own(document: minidom.Document) -> list[str]:
+    """An SDF without what is PyBullet's own, at which Drake stops; an empty link called
+    world is the world."""
+    gone = dict[str, None]()
+    for link in document.getElementsByTagName("link"):
+        if link.getAttribute("name") == "world" and not children(link, "inertial"):
+            _remove(link)
+    for parent, name in _BULLETS:
+        for element in list(document.getElementsByTagName(name)):
+            if getattr(element.parentNode, "tagName", "") == parent:
+                _remove(element)
+                gone[f"<{name}> of a {parent}"] = None
+    for element_name, mark in _BULLETS_MARKS:
+        for element in document.getElementsByTagName(element_name):
+            if element.hasAttribute(mark):
+                element.removeAttribute(mark)
+                gone[f"{mark} of a {element_name}"] = None
+    if not gone:
+        return []
+    return [f"{', '.join(gone)}: PyBullet's own words, which are left out"]
 
 
 def _without_commas(document: minidom.Document) -> list[str]:

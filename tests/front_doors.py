@@ -9,6 +9,7 @@ channels hold what the robot did: then no mass has to make up for anything.
 """
 
 import argparse
+import json
 import re
 import sys
 import tempfile
@@ -1080,6 +1081,96 @@ KINDS |= {
     ),
     "goals beside efforts": goals_late,
 }  # fmt: skip
+
+
+def joint_state(text: str) -> str:
+    """As `ros2 topic echo --csv` writes it: joints by name, and no header."""
+    head, *rows = text.splitlines()
+    order = sorted(range(1, len(head.split(","))),
+                   key=lambda k: ["position", "velocity", "effort"].index(
+                       head.split(",")[k].split("_")[1]))  # fmt: skip
+    named = ",".join(f"joint{i + 1}" for i in range(len(order) // 3))
+    out = []
+    for row in rows:
+        cells = row.split(",")
+        stamp = (
+            f"{1_764_300_000 + int(float(cells[0]))},{round(float(cells[0]) % 1 * 1e9)}"
+        )
+        out.append(f"{stamp},base,{named},{','.join(cells[k] for k in order)}\n")
+    return "".join(out)
+
+
+def long(text: str) -> str:
+    """A row for each joint."""
+    head, *rows = (line.split(",") for line in text.splitlines())
+    n = (len(head) - 1) // 3
+    out = ["time,joint,position,velocity,effort"]
+    for row in rows:
+        for i in range(n):
+            out.append(f"{row[0]},joint{i + 1},{','.join(row[3 * i + 1 : 3 * i + 4])}")
+    return "\n".join(out) + "\n"
+
+
+def json_lines(log: Log):
+    def write(folder: Path, columns: dict) -> Path:
+        path = folder / "log.jsonl"
+        each = [[columns[n] for n in names(log, w)] for w in ("position", "effort")]
+        path.write_text("".join(
+            json.dumps({"t": t, "q": [y[k] for y in each[0]],
+                        "tau": [y[k] for y in each[1]]}) + "\n"
+            for k, t in enumerate(log.time)
+        ))  # fmt: skip
+        return path
+
+    log.truth = {k: y for k, y in log.truth.items() if "velocity" not in k}
+    log.write = write
+    return ("",)
+
+
+def after_a_base(log: Log):
+    """All coordinates, as MuJoCo and pinocchio have them."""
+    still = {f"qpos_{k}": np.full(len(log.time), float(k == 3)) for k in range(7)}
+    still |= {f"qvel_{k}": np.zeros(len(log.time)) for k in range(6)}
+    own = {}
+    for what, name, n in (("position", "qpos", 7), ("velocity", "qvel", 6),
+                          ("effort", "ctrl", 0)):  # fmt: skip
+        for k, column in enumerate(names(log, what)):
+            own[f"{name}_{k + n}"] = log.columns[column]
+    log.columns = still | own
+    log.truth = {k.replace("_measured", "_command"): y for k, y in log.truth.items()}
+    return ("of an unknown joint",)
+
+
+def at_the_motor(log: Log):
+    """Everything on the motor's side of one gear."""
+    for i in range(log.joints):
+        if not log.slides[i]:
+            log.columns[f"joint{i + 1}_position"] *= 64.0
+            log.columns[f"joint{i + 1}_velocity"] *= 64.0
+            log.columns[f"joint{i + 1}_effort"] /= 64.0
+    return ("64 times as large as at the joint", "smaller than the model needs")
+
+
+def listed_beside(text: str) -> str:
+    """A text in quotes that has commas, as of a list."""
+    head, *rows = text.splitlines()
+    more = "\"['a', 'b', 'c']\","
+    return "\n".join([f"name,{head}", *(more + row for row in rows)]) + "\n"
+
+
+KINDS |= {
+    # A fifth time: of public robots, as tools write their logs.
+    "a message without names": as_text(joint_state, ""),
+    "a row for each joint": as_text(long, ""),
+    "durations": as_text(lambda text: re.sub(r"(?m)^([\d.]+),", r"\1 sec,", text), ""),
+    "lines of JSON": json_lines,
+    "coordinates after a base's": after_a_base,
+    "all at the motor": at_the_motor,
+    "a time in another language": as_text(
+        lambda text: text.replace("time", "Zeit", 1), ""
+    ),
+    "a list of texts beside": as_text(listed_beside, ""),
+}
 UNSEEN = list(KINDS)[list(KINDS).index("one velocity in degrees") :]
 
 

@@ -221,3 +221,63 @@ def test_what_the_file_gives_no_drive_has_none(tmp_path, suffix, passive, driven
         assert f"actuation: {{type: effort, joints: [{joints}]}}" in proposal.scene
         said = any("nothing drives arm.puck" in note for note in proposal.notes)
         assert said == (of_puck == passive)
+
+
+def judged(folder, change, robot="three"):
+    """What is said of a log whose columns and times `change` alters in place."""
+    path, log = exact(robot, folder, np.random.default_rng(4))
+    columns = {"time": log.time.copy()} | log.columns
+    change(columns)
+    proposal = propose_scene(
+        read_robot(path), [read_log(csv(folder / "log.csv", columns))]
+    )
+    return {each.kind: each.says for each in proposal.said}
+
+
+def test_a_joint_without_a_command_beside_others_is_told(tmp_path):
+    path, log = exact("three", tmp_path, np.random.default_rng(4))
+    columns = {"time": log.time}
+    for k in (1, 2, 3):
+        columns[f"joint{k}_position"] = q = log.columns[f"joint{k}_position"]
+        columns[f"joint{k}_command"] = np.append(q[5:], q[-5:])
+    told = []
+    for _ in range(2):
+        read = read_log(csv(tmp_path / "log.csv", columns))
+        notes = propose_scene(read_robot(path), [read]).notes
+        told.append([note for note in notes if "in this scene nothing does" in note])
+        columns.pop("joint2_command", None)
+    assert told[0] == [] and "what drives arm.joint2:" in told[1][0]
+
+
+def test_efforts_of_another_motion_are_said_to_explain_nothing(tmp_path):
+    def other(columns):
+        for name in [n for n in columns if n.endswith("effort")]:
+            columns[name] = np.random.default_rng(1).normal(size=len(columns[name]))
+
+    assert "in its joints' order" in judged(tmp_path, other)["effort_unexplained"]
+    assert judged(tmp_path, lambda columns: None) == {}
+
+
+@pytest.mark.parametrize(("late", "said"), [(0.03, True), (0.0, False), (-0.03, False)])
+def test_efforts_stamped_late_are_said_to_be(tmp_path, late, said):
+    """Commands that act later than their stamps are what a search names."""
+
+    def shift(columns):
+        for name in [n for n in columns if n.endswith("effort")]:
+            t = columns["time"]
+            columns[name] = np.interp(t - late, t, columns[name])
+
+    found = judged(tmp_path, shift)
+    assert ("effort_late" in found) == said
+    assert not said or "30 ms before" in found["effort_late"]
+
+
+def test_efforts_in_parts_of_unknown_ratings_are_asked_about(tmp_path):
+    """Two of three joints could be explained by nothing but their unit."""
+
+    def rated(columns):
+        for name, rating in (("joint2_effort", 4.0), ("joint3_effort", 3.0)):
+            columns[name] = columns[name] * rating
+
+    found = judged(tmp_path, rated)
+    assert "joint2_effort, joint3_effort: larger" in found["effort_unsure"]

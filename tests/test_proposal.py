@@ -446,7 +446,8 @@ def test_a_log_or_a_robot_that_tells_nothing_is_refused(
     log = tmp_path / "a.csv"
     rows = "\n".join(f"{k * 0.01},{k}" for k in range(50))
     for header, message in (
-        ("x,y", "no column looks like a time"),
+        ("q,y", "no column looks like a time"),
+        ("x,y", "no column looks like the position of a joint"),  # x is even.
         ("t,y", "no column looks like the position of a joint"),
     ):
         log.write_text(f"{header}\n{rows}\n")

@@ -73,6 +73,24 @@ def proposal_of(folder, path, names=("j1", "j2")):
     return propose_scene(read_robot(path), [read_log(folder / "log.csv")])
 
 
+def test_an_sdf_with_pybullets_own_words_is_read(tmp_path):
+    """Its gripper slides from the world, which is a link there."""
+    path = tmp_path / "gripper.sdf"
+    path.write_text("""<sdf version="1.6"><world name="default"><model name="g">
+<link name="world"/><joint name="base_joint" type="prismatic"><parent>world</parent>
+<child>base</child><axis><xyz>1 0 0</xyz></axis></joint><link name="base"><contact>
+<lateral_friction>1.0</lateral_friction></contact><inertial><mass>2</mass></inertial>
+<collision name="c" concave="yes"><geometry><box><size>1 1 1</size></box></geometry>
+<material/></collision></link></model></world></sdf>""")
+    own = read_robot(path)
+    assert [j.name for j in own.joints] == ["g.base_joint"] and own.bases == ()
+    (note,) = own.file.notes
+    assert note == (
+        "<contact> of a link, <material> of a collision, concave of a collision: "
+        "PyBullet's own words, which are left out"
+    )
+
+
 def test_columns_are_judged_by_inertias_as_the_scene_has_them(tmp_path):
     """Of a foot with moments and no mass Drake makes a ball of 1 kg."""
     foot = (

@@ -1,4 +1,4 @@
-"""Dictionaries of arrays as one table: .npz, MATLAB's .mat.
+"""Dictionaries of arrays as one table: .npz, MATLAB's .mat, lines of JSON.
 
 What has a row for each instant is a column, whichever way round it lies; a number such
 as `dt` or `frequency` gives the time where no column does; a list of joints' names
@@ -6,6 +6,7 @@ names the columns of arrays that are as wide. What is none of these is left out,
 said.
 """
 
+import json
 import re
 import zipfile
 import zlib
@@ -20,7 +21,7 @@ FEWEST = 10  # Numbers in what may be a column.
 TIME_WORDS = set(
     "time t timestamp timestamps stamp stamps ts sec secs seconds clock utime datetime "
     "walltime epoch nsec nsecs usec usecs msec msecs nanoseconds microseconds "
-    "milliseconds tout".split()
+    "milliseconds millis micros tick ticks tout".split()
 )
 # Scalars between two rows, and of rows a second, in small letters without signs.
 _PERIOD = re.compile(r"(\w*(time|step|control|sim|sample)_?)?(dt|period)|time_?step|"
@@ -29,7 +30,8 @@ _RATE = re.compile(r"\w*(frequency|freq|hz|fs)|\w*(sampl(e|ing)|control|log)_?ra
 _OF_A_BODY = set("quat quaternion root base imu pose foot feet contact".split())
 _PICKLES = (".pt", ".pth", ".pkl", ".pickle", ".joblib", ".npy")
 _HDF5 = (".h5", ".hdf5", ".hdf")
-ARRAYS = (".npz", ".mat")
+_LINES = (".jsonl", ".ndjson")
+ARRAYS = (".npz", ".mat", *_LINES)
 
 Read = tuple[dict[str, np.ndarray], np.ndarray, int, list[tuple[str, str]]]
 
@@ -130,6 +132,36 @@ def read_mat(path: Path, most_cells: int, unused: frozenset[str]) -> Read:
     own = {k: v for k, v in content.items() if not k.startswith("__")}
     flat = {k: v for k, v in _leaves("", own) if k not in unused}
     return _table(path, list(flat), flat.get, most_cells)
+
+
+def read_lines(path: Path, most_cells: int, unused: frozenset[str]) -> Read:
+    """The same of a text that has a JSON object in each line.
+
+    Raises: ValueError, one line.
+    """
+    rows = []
+    for k, line in enumerate(path.read_text(errors="replace").splitlines(), start=1):
+        try:
+            rows += [dict(_leaves("", json.loads(line)))] if line.strip() else []
+        except ValueError as error:
+            raise ValueError(f"recording {path}, line {k}: {error}") from None
+    names = [
+        n for n in dict.fromkeys(n for row in rows for n in row) if n not in unused
+    ]
+
+    def load(name: str):
+        each = [row.get(name) for row in rows]
+        some = np.asarray(next(x for x in each if x is not None))
+        none = np.full(some.shape, np.nan)
+        try:
+            return np.array([none if x is None else x for x in each])
+        except ValueError:
+            return None
+
+    return _table(path, names, load, most_cells)
+
+
+READERS = {".npz": read_npz, ".mat": read_mat, **dict.fromkeys(_LINES, read_lines)}
 
 
 def _leaves(name: str, value) -> Iterator[tuple[str, object]]:

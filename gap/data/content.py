@@ -20,7 +20,7 @@ from itertools import combinations, permutations
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
-from scipy.optimize import linear_sum_assignment
+from scipy.optimize import linear_sum_assignment, minimize_scalar
 
 from makebreak.gap.data.findings import Finding
 from makebreak.gap.data.match import AS_SAID, JointName, Match
@@ -32,6 +32,7 @@ from makebreak.gap.data.servo_gains import (
     needed_efforts,
 )
 from makebreak.gap.data.turns import TURN, without_turns
+from makebreak.gap.data.units import BY_SIZE, TURNING, Unit
 from makebreak.models.effects.kind import actuator_of, full_name, one_dof_joints
 
 MOST_SAMPLES = 1000  # At which inverse dynamics is computed.
@@ -39,6 +40,8 @@ MOST_SEC = 60.0  # Of a log that is looked at.
 EXPLAINS, NOTHING = 0.9, 0.5  # Shares of what is predicted: is told by it, is not.
 CLEARER = 5.0  # Times less is left by another joint's column than by its own.
 TOLD_WELL = 0.01  # Of what is predicted: no other unit can tell it much better.
+NEARLY_ALL = 1e-4  # The same where a unit is but told by how large numbers are.
+LEAST_LEFT = 1e-5  # Less is rounding.
 GIVES_WAY = 0.05  # [rad], [m]
 LEAST_TOLD = 0.3  # Of a column that is not noise, to judge it without that.
 PARTS = 5  # Of the data: a factor scatters over them.
@@ -56,12 +59,28 @@ FEW = 100  # Instants at which many readings are tried.
 # off where one has another zero.
 ALL_ORDERS, MOST_ORDERED, MOST_OFF = 6, 8, 8
 ROOM = 0.1  # Of a joint's range, beyond it.
+# Logarithms: of gears that are tried, and the step between two.
+LARGEST_GEAR, GEAR_STEP = 5.7, 0.1
+FAR = 1000.0  # [rad] No joint turns by so much between its limits.
+LATEST_SEC, LATE_STEP_SEC = 0.1, 0.01
 NO_WEIGHT = 0.02  # Of what an effort without weight leaves at most.
 # Of one joint alone, what it carries may make its effort so many times larger; what
 # holds it up, smaller.
 LARGE, LARGER = 20.0, 3.0
 WITHOUT_WEIGHT = "effort_without_weight"
-_SEVERITY = {"no_content": "warning", "too_short": "info"}  # Else: an error.
+UNSURE, LATE = "effort_unsure", "effort_late"
+UNEXPLAINED = "effort_unexplained"
+_UNSURE = (
+    "larger than the model needs, several times, and no rotor would do: another unit, "
+    "or a load or a spring that the model lacks; taken as it is"
+)
+_SEVERITY = {
+    "no_content": "warning",
+    "too_short": "info",
+    UNSURE: "warning",
+    LATE: "warning",
+    UNEXPLAINED: "warning",
+}  # Else: an error.
 _DRIVES = ("effort_command", "effort_measured")
 _UNITS = (
     (1e-3, "as if in N mm, or per mille of N m"), (1e-2, "as if in N cm, or per cent"),
@@ -177,6 +196,7 @@ class Contents:
         self._rows = self._rows[: np.searchsorted(t, t[0] + MOST_SEC)]
         self._time = time[self._rows]
         self._all_time = time
+        self.period = float(np.median(np.diff(self._time))) if len(q) > 1 else 0.0
         q = q[self._rows]
         averaged = averaged_motion(ServoLog(self._time, q, q)) if len(q) > 20 else None
         if averaged is None:
@@ -184,6 +204,7 @@ class Contents:
         self._even, _, _, self._kernels, states = averaged
         self._some = slice(None, None, max(len(states[0]) // MOST_SAMPLES, 1))
         self._motion = [x[self._some].copy() for x in states]
+        self.late = 0.0  # [s] How late columns are taken to be.
         self.take(*self._motion)
 
     def take(self, q: np.ndarray, v: np.ndarray, vd: np.ndarray) -> None:
@@ -253,7 +274,7 @@ class Contents:
             return None
         if half is not None:
             there = np.flatnonzero(there)[half::2]
-        even = np.interp(self._even, self._all_time[there], y[there])
+        even = np.interp(self._even + self.late, self._all_time[there], y[there])
         return np.convolve(even, self._kernels[0], "valid")[self._some]
 
     def of_velocity(self, name: str, i: int) -> Likeness | None:
@@ -325,8 +346,11 @@ def by_content(
     matches = _all_ordered(contents, matches, said)
     matches = _from_their_zeros(contents, matches, said)
     matches = _drives_that_drive(contents, matches, said)
-    matches = _in_turns(contents, matches, said)
-    return _with_factors(contents, matches, said), said
+    matches = _in_other_units(contents, matches, said)
+    matches = _with_factors(contents, matches, said)
+    _unexplained(contents, matches, said)
+    _late(contents, matches, said)
+    return matches, said
 
 
 # ----- What has no content
@@ -365,46 +389,81 @@ def _without_empty(columns, matches: Sequence[Match], said) -> list[Match]:
 # ----- What angles are counted in, and which way
 
 
-def _misfit(contents: Contents, efforts: Mapping[int, str]) -> float:
-    """Mean logarithm of the shares that efforts do not explain."""
-    each = [contents.of_effort(name, i) for i, name in efforts.items()]
+def _misfit(contents: Contents, efforts: Mapping[int, str], rotor=False) -> float:
+    """Mean logarithm of the shares that efforts do not explain. rotor: as of
+    of_effort."""
+    each = [contents.of_effort(name, i, rotor) for i, name in efforts.items()]
     left = [1.0 if x is None else 1.0 - x.explained for x in each]
-    return float(np.mean(np.log(np.maximum(left, 1e-3))))
+    return float(np.mean(np.log(np.maximum(left, LEAST_LEFT))))
 
 
-def _in_turns(contents: Contents, matches, said) -> list[Match]:
-    """Angles that are counted in turns, by the efforts: of what swings they go with
-    the sine. Half as much is then left of them, and the limits allow it."""
+def _in_other_units(contents: Contents, matches, said) -> list[Match]:
+    """Angles that are counted in turns, in steps of an encoder, or on the motor's side
+    of one gear, by the efforts: of what swings they go with the sine. Much less is then
+    left of them, and the limits allow it."""
     efforts = _columns_of(contents, matches, _DRIVES)
     mine = _columns_of(contents, matches, ("position",))
     group = [i for i in mine if not contents.joints[i].prismatic]
-    before = _misfit(contents, efforts) if efforts and group else -np.inf
-    if before < np.log(TOLD_WELL):
+    before = _misfit(contents, efforts, True) if efforts and group else -np.inf
+    sized = any(m.told.endswith(BY_SIZE) for m in matches if m.column in mine.values())
+    if before < np.log(NEARLY_ALL if sized else TOLD_WELL):
         return matches
-    contents.scaled(group, TURN)
-    joints = [contents.joints[i] for i in group]
-    after = _misfit(contents, efforts)
-    if not contents.is_inside() or after > min(
-        np.log(1.0 - EXPLAINS), before - np.log(2.0)
+    few = contents.fewer(FEW)
+
+    def left(log_factor: float) -> float:
+        few.scaled(group, np.exp(log_factor))
+        out = _misfit(few, efforts, True) if few.is_inside() else 0.0
+        few.scaled(group, np.exp(-log_factor))
+        return out
+
+    scales = {m.column: abs(m.scale) for m in matches}
+    scale = scales[mine[group[0]]]
+    far = float(np.ptp(contents.q[:, group], axis=0).max()) > FAR
+    known = [u for u in (TURNING if sized or far else [Unit("turns", TURN)])
+             if abs(np.log(u.factor / scale)) > ALIKE]  # fmt: skip
+    tried = [float(np.log(u.factor / scale)) for u in known]
+    # Of rad that lie within the limits nobody asks for a gear.
+    tried += [*np.arange(-LARGEST_GEAR, LARGEST_GEAR, GEAR_STEP)] if sized else []
+    if not tried:
+        return matches
+    best = min(tried, key=left)
+    if sized:
+        near = (best - GEAR_STEP, best + GEAR_STEP)
+        best = minimize_scalar(left, bounds=near, method="bounded").x
+    unit = next(
+        (u for u in known if abs(best - np.log(u.factor / scale)) < ALIKE), None
+    )
+    gear = _round(np.exp(-best) / scale, 0.005 * np.exp(-best) / scale)
+    factor = (1.0 / gear if unit is None else unit.factor) / scale
+    contents.scaled(group, factor)
+    after, clearer = _misfit(contents, efforts, True), 2.0 if unit else CLEARER
+    if (
+        not contents.is_inside()
+        or abs(np.log(factor)) < ALIKE
+        or after > min(np.log(1.0 - EXPLAINS), before - np.log(clearer))
     ):
-        contents.scaled(group, 1.0 / TURN)
+        contents.scaled(group, 1.0 / factor)
         return matches
-    names = {j.name for j in joints}
+    names = {contents.joints[i].name for i in group}
     speeds = _columns_of(contents, matches, ("velocity",))
     found = {i: contents.of_velocity(speeds[i], i) for i in group if i in speeds}
-    alike = {contents.joints[i].name for i, x in found.items()
-             if x is not None and abs(x.factor / TURN - 1.0) < KNOWN_TO}  # fmt: skip
+    alike = {
+        contents.joints[i].name for i, x in found.items() if x is not None
+        and abs(abs(x.factor) / scales[speeds[i]] / factor - 1.0) < KNOWN_TO
+    }  # fmt: skip
+    word = f"in {unit.name}" if unit else f"{gear:g} times as large as at the joint"
+    word += "" if unit else ", as on the motor's side of a gear"
     out, moved = [], []
     for m in matches:
         at, _, what = (m.channel or "").rpartition(".")
         here = "position" in what and at in names or what == "velocity" and at in alike
         if m.why != AS_SAID and here:
-            why = f"{m.why}; in turns, by the efforts"
-            m = replace(m, scale=m.scale * TURN, offset=m.offset * TURN, why=why)
+            why = f"{m.why}; {word}, by the efforts"
+            m = replace(m, scale=m.scale * factor, offset=m.offset * factor, why=why)
             moved.append(m.column)
         out.append(m)
-    says = f"By the efforts that go with them, {', '.join(moved)} are in turns."
-    said.append(Said("units", joints[0].name, TURN, says))
+    says = f"By the efforts that go with them, {', '.join(moved)} are {word}."
+    said.append(Said("units", contents.joints[group[0]].name, factor, says))
     return out
 
 
@@ -698,8 +757,8 @@ def _drives_that_drive(contents: Contents, matches, said) -> list[Match]:
     return out
 
 
-def _share(contents: Contents, column: str, i: int) -> float:
-    found = contents.of_effort(column, i)
+def _share(contents: Contents, column: str, i: int, rotor: bool = False) -> float:
+    found = contents.of_effort(column, i, rotor)
     return 0.0 if found is None else found.explained
 
 
@@ -730,13 +789,59 @@ def _with_factors(contents: Contents, matches, said) -> list[Match]:
             mine = [i for i, (_, own) in factors.items() if own == word]
             names = ", ".join(out[found[i][0]].column for i in mine)
             scales = sorted({f"{factors[i][0]:.4g}" for i in mine}, key=float)
-            says = f"{names}: {word}. Taken times {', '.join(scales)}"
-            if abs(factors[mine[0]][0]) != 1.0:
+            factor, says = factors[mine[0]][0], f"{names}: {word}"
+            kind = {1.0: UNSURE, -1.0: "effort_sign"}.get(factor, "effort_factor")
+            if kind != UNSURE:
+                says += f". Taken times {', '.join(scales)}"
+            if kind == "effort_factor":
                 says += "; or the masses of the model are off by that, all alike"
-            kind = "effort_sign" if abs(factors[mine[0]][0]) == 1.0 else "effort_factor"
             channel = f"{contents.joints[mine[0]].name}.{what}"
-            said.append(Said(kind, channel, factors[mine[0]][0], f"{says}."))
+            said.append(Said(kind, channel, factor, f"{says}."))
     return out
+
+
+def _unexplained(contents: Contents, matches, said) -> None:
+    """Says where efforts do not go with the motion, whatever they count in."""
+    efforts = _columns_of(contents, matches, _DRIVES)
+    # In one swing a rotor's torque and the weight are the same.
+    left = {i: max(_share(contents, name, i), _share(contents, name, i, True))
+            for i, name in efforts.items() if contents.moves(i)}  # fmt: skip
+    off = [i for i, share in left.items() if share < NOTHING]
+    if 2 * len(off) > len(left):
+        says = (
+            f"{', '.join(efforts[i] for i in off)} explain less than {NOTHING:.0%} of "
+            "what the model needs for the motion: are these the robot's columns, in "
+            "its joints' order, and nothing pushes it?"
+        )
+        said.append(Said(UNEXPLAINED, contents.joints[off[0]].name, len(off), says))
+
+
+def _late(contents: Contents, matches, said) -> None:
+    """Says where efforts are measured, or stamped, after they have acted. (Before it,
+    they may be commands that come through late, which a search names.)"""
+    efforts = _columns_of(contents, matches, _DRIVES)
+    before = _misfit(contents, efforts, True) if efforts else -np.inf
+    if before < np.log(TOLD_WELL):
+        return
+    few = contents.fewer(FEW)
+
+    def left(late: float) -> float:
+        few.late = late
+        return _misfit(few, efforts, True)
+
+    start = min(np.arange(-LATEST_SEC, LATEST_SEC, LATE_STEP_SEC), key=left)
+    near = (start - LATE_STEP_SEC, start + LATE_STEP_SEC)
+    late = float(minimize_scalar(left, bounds=near, method="bounded").x)
+    contents.late = late
+    after, contents.late = _misfit(contents, efforts, True), 0.0
+    if late > contents.period and after < before - np.log(CLEARER):
+        says = (
+            f"{', '.join(efforts.values())} go with the motion {1e3 * late:.2g} ms "
+            "before their stamps: they are filtered or stamped late, or have another "
+            "clock."
+        )
+        first = contents.joints[next(iter(efforts))].name
+        said.append(Said(LATE, first, late, says))
 
 
 def _factors(
@@ -779,7 +884,7 @@ def _factors(
                if f < 0.0 or not 1.0 / LARGE < f < LARGER}  # fmt: skip
     if alike:  # Of joints that do not tell, as of those that do.
         odd = dict.fromkeys(found, middle)
-    out = {}
+    out = {i: (1.0, _UNSURE) for i, x in known.items() if x.factor < GAINS[0]}
     for i, factor in odd.items():
         std = found[i][1].std if not alike else within
         out[i] = _in_words(factor, std)

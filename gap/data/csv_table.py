@@ -14,6 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
+from makebreak.gap.data.reshaped import reshaped
+
 _BLOCK = 1 << 23  # [bytes] of text that are parsed at a time.
 NAMELESS = "column_"  # What columns without a name are called, with their number.
 _HEAD = 60  # Lines among which names are looked for.
@@ -37,12 +39,19 @@ _CLOCK = re.compile(
 )
 
 
+# A unit of SI behind a number, as MATLAB writes durations.
+_IN_SI = re.compile(
+    rb"(?<=\d) ?(?:sec|s|rad(?:/s)?|m(?:/s)?|N|N ?m)(?=[\"\s]*(?:[,;\t\r\n]|$))"
+)
+
+
 @dataclass(frozen=True)
 class Dialect:
     """How a csv file is written. names: of its columns; lists: {column: how many
     numbers its cells hold}, of cells as [1, 2, 3]; unused: columns that may hold
     anything; headless: the first line is a row, and the names are column_1, ...;
-    stamped: some cells are dates with times, which become seconds since 1970; holey:
+    stamped: some cells are dates with times, which become seconds since 1970, or
+    numbers with their unit; holey:
     some cells say in a word that nothing is there."""
 
     separator: str
@@ -106,8 +115,13 @@ class BadRows:
 
 
 def open_csv(path: Path):
-    """A binary file to read from."""
-    return gzip.open(path, "rb") if path.suffix.lower() == ".gz" else path.open("rb")
+    """A binary file to read from, with a row for each instant."""
+    file = gzip.open(path, "rb") if path.suffix.lower() == ".gz" else path.open("rb")
+    other = reshaped(file)
+    if other is None:
+        return file
+    file.close()
+    return other
 
 
 def size_of(path: Path) -> int:
@@ -225,7 +239,7 @@ def dialect_of(
             if name.count(".") > 1 or not name:  # As a channel's.
                 raise ValueError(f'recording {path}: column "{name}" is there twice')
             names[k] = name + " (again)" * names[:k].count(name)
-    stamped = any(each.search(header + sample) for each in (_STAMP, _CLOCK))
+    stamped = any(each.search(header + sample) for each in (_STAMP, _CLOCK, _IN_SI))
     lines = _in_seconds(sample).decode(errors="replace").splitlines()[:50]
     lists: dict[str, int] = {}
     if "[" in "".join(lines):
@@ -267,7 +281,7 @@ def _in_seconds(text: bytes) -> bytes:
         whole += int(rest)
         return b"%d.%s" % (whole, fraction or b"0")
 
-    return _CLOCK.sub(of_day, _STAMP.sub(seconds, text))
+    return _IN_SI.sub(b"", _CLOCK.sub(of_day, _STAMP.sub(seconds, text)))
 
 
 def is_nameless(column: str) -> bool:
@@ -366,7 +380,9 @@ def parse(
 
 
 def _unquoted(cell: bytes, dialect: Dialect) -> bytes:
-    return cell.replace(b",", b".") if dialect.decimal_comma else cell
+    if dialect.decimal_comma:
+        return cell.replace(b",", b".")
+    return cell.replace(dialect.separator.encode(), b" ")  # A text, as of a list.
 
 
 def _by_line(

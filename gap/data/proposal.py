@@ -26,14 +26,16 @@ _COMMAND = set(
 _WORDS = {
     "acceleration": set("acc acceleration accelerations ddq qdd accel".split()),
     "current": set("current currents amp amps ampere".split()),
-    "effort": set("effort efforts eff torque torques tau trq moment moments u".split()),
+    "effort": set(
+        "effort efforts eff torque torques tau trq moment moments u ctrl".split()
+    ),
     "force": set("force forces thrust".split()),
     "velocity": set(
-        "velocity velocities vel vels dq qd qdot speed speeds omega velo v".split()
+        "velocity velocities vel vels dq qd qdot qvel speed speeds omega velo v".split()
     ),
     "position": set(
         "position positions pos q qpos angle angles theta phi deg rad state states "
-        "joint joints encoder action".split()
+        "joint joints axis axes encoder action".split()
     ),
 }
 CURRENT = "a current"  # Why such a column is left out begins so.
@@ -98,7 +100,7 @@ def propose(
         else:
             quantities[name] = quantity
     listed = _listed(text, joints)
-    for name, joint in _joints_of(quantities, joints, listed).items():
+    for name, joint in _joints_of(quantities, joints, listed, columns).items():
         quantity = quantities[name]
         if quantity in _OF_A_SLIDE:
             if joint is None or not joint.prismatic or not _names(name, joint):
@@ -222,7 +224,8 @@ def _quantity(name: str, named: Sequence[JointName]) -> str | None:
     if kind == "current":  # Without its gain it is no effort.
         return None if command else CURRENT
     if kind == "effort":
-        return "effort_command" if command or "u" in words else "effort_measured"
+        is_input = {"u", "ctrl"} & {*words}  # As MuJoCo has what actuators are given.
+        return "effort_command" if command or is_input else "effort_measured"
     if kind == "force":
         return _FORCE_COMMAND if command else _FORCE
     return f"{kind}_command" if command else kind
@@ -273,6 +276,7 @@ def _joints_of(
     quantities: Mapping[str, str],
     joints: Sequence[JointName],
     listed: Mapping[int, JointName],
+    columns: Mapping[str, np.ndarray],
 ) -> dict[str, JointName | None]:
     """By the joint's own name in the column's, or by words of it that no other joint
     has; else by the number in the column's, among the joints that share such words, or
@@ -298,7 +302,7 @@ def _joints_of(
         if listed and set(of.values()) <= {*listed}:
             found |= {name: listed[number] for name, number in of.items()}
         else:
-            found |= _by_number(of, group, joints)
+            found |= _by_number(_after_base(of, len(group), columns), group, joints)
     return found
 
 
@@ -316,11 +320,33 @@ def _by_number(
         and set(of.values()) <= {*own}
     ):
         return {name: own[number] for name, number in of.items()}
-    base = 0 if 0 in of.values() else 1
+    base = 0 if min(of.values()) <= 0 else 1
     places = {name: number - base for name, number in of.items()}
     return {
         name: group[k] if 0 <= k < len(group) else None for name, k in places.items()
     }
+
+
+def _after_base(
+    of: Mapping[str, int], n: int, columns: Mapping[str, np.ndarray]
+) -> dict[str, int]:
+    """{column: number} without those of a floating base, which come first where a list
+    has all coordinates (MuJoCo, pinocchio): 7 of positions, with a quaternion, and 6 of
+    velocities before those of n joints."""
+    lists: dict[str, list[str]] = {}
+    for name in of:
+        lists.setdefault(re.sub(r"\d+(?=\D*$)", "", name), []).append(name)
+    more = {key: len(own) - n for key, own in lists.items()}
+    found = dict(of)
+    free = any(
+        more[key] == 7
+        and np.allclose(sum(columns[k] ** 2 for k in own[3:7]), 1.0, atol=0.01)
+        for key, own in lists.items()
+    )
+    for key, own in lists.items():
+        if free and more[key] in (6, 7):
+            found |= {name: of[name] - more[key] for name in own}
+    return found
 
 
 def _own_words(joints: Sequence[JointName]) -> list[tuple[JointName, set[str]]]:
@@ -372,9 +398,11 @@ def _once(found: dict[str, Match], said: Mapping[str, Match]) -> dict[str, Match
 def find_time(columns: Mapping[str, np.ndarray]) -> Match | None:
     """The first column that increases and has a word for time in its name, or a unit of
     it in brackets (in any language), or no name and even steps; else one that counts
-    from 1970, as dates do."""
+    from 1970, as dates do, or one of even steps that says no quantity."""
     dated = [n for n, y in columns.items() if (y > _SINCE_1970).any() and _is_even(y)]
-    for k, name in enumerate([*columns, *dated]):
+    even = [n for n, y in columns.items() if _is_even(y) and not _counts(y)
+            and not any(map(says_quantity, words_of(n)))]  # fmt: skip
+    for k, name in enumerate([*columns, *dated, *even]):
         value, words = columns[name], words_of(name)
         if not (
             k >= len(columns)
@@ -435,13 +463,15 @@ def _without_unknown_efforts(
 
 
 def _by_motion(found: dict[str, Match], columns) -> dict[str, Match]:
-    """qd may be a speed or a command of position: what it goes with tells."""
+    """qd may be a speed or a command of position, and ctrl a command of either kind:
+    what it goes with tells."""
     out = dict(found)
     for name, match in found.items():
-        channel = match.channel or ""
-        if "qd" not in words_of(name) or not channel.endswith(".velocity"):
+        at, _, what = (match.channel or "").rpartition(".")
+        if (what, {"qd", "ctrl"} & {*words_of(name)}) not in (
+            ("velocity", {"qd"}), ("effort_command", {"ctrl"})
+        ):  # fmt: skip
             continue
-        at = channel.removesuffix(".velocity")
         position = _with_channel(found, f"{at}.position")
         taken = any(m.channel == f"{at}.position_command" for m in found.values())
         if position is None or taken:
@@ -450,7 +480,8 @@ def _by_motion(found: dict[str, Match], columns) -> dict[str, Match]:
         good = np.isfinite(q) & np.isfinite(y)
         if good.sum() < 50 or not (np.ptp(q[good]) > 0.0 and np.ptp(y[good]) > 0.0):
             continue
-        if np.corrcoef(q[good], y[good])[0, 1] > 0.9:
+        near = np.std(q[good] - y[good]) < 0.5 * np.std(q[good])
+        if np.corrcoef(q[good], y[good])[0, 1] > 0.9 and near:
             why = "it follows the position"
             out[name] = Match(name, f"{at}.position_command", why=why)
     return out

@@ -13,6 +13,7 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 
+from makebreak.gap.data.arrays import is_time
 from makebreak.gap.data.bags import MotorRange, is_dataset, motor_ranges
 from makebreak.gap.data.base_pose import BasePose, base_pose
 from makebreak.gap.data.content import (
@@ -279,6 +280,7 @@ def matches_of(log: Log, robot: Robot | None) -> list[Match]:
     return propose(log.table.columns, joints, log.text, said, log.ranges)
 
 
+_STEPS = "it does not increase from row to row, as of too few digits"
 BASE_MOVES = "base_moves"
 NO_ACTUATION = ["actuation: {type: none}"]
 FROM_SAG = "from how far joints sag below their commands"
@@ -455,8 +457,10 @@ def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
     for path, matches in every.items():
         channels = {m.channel for m in matches if m.channel}
         if "time" not in channels:
+            named = [m.column for m in matches if is_time(m.column)]
+            says = f" ({', '.join(named)}: {_STEPS})" if named else ""
             raise ValueError(
-                f"recording {path}: no column looks like a time; name it in "
+                f"recording {path}: no column looks like a time{says}; name it in "
                 f"{stem_of(path)}.yaml: columns: {{NAME: time}}"
             )
         if not any(c.endswith(".position") for c in channels):
@@ -680,6 +684,12 @@ def _actuation(
                 )
             joints = [j.name for j in robot.joints if j.name in (*joints, *untold)]
             return [f"actuation: {{type: effort, joints: [{', '.join(joints)}]}}"], ""
+    joints = named("position_command") or named("velocity_command")
+    rest = [name for name in named("position") if name not in joints]
+    if joints and rest:
+        notes.append(
+            f"no column says what drives {', '.join(rest)}: in this scene nothing does"
+        )
     if joints := named("position_command"):
         gains = _gains_by_motion(robot, every, logs)
         stiff = _stiffness(robot, every, logs)

@@ -26,9 +26,8 @@ import numpy as np
 
 from makebreak.gap.data.arrays import (
     ARRAYS,
+    READERS,
     kept_rows,
-    read_mat,
-    read_npz,
     spread,
     why_not,
 )
@@ -53,7 +52,7 @@ WRENCH = "fx fy fz tx ty tz".split()
 QUANTITIES = frozenset([*JOINT_QUANTITIES, *POSE, *TWIST, *WRENCH])
 _TEXTS = (".csv", ".txt", ".tsv", ".dat")
 FORMATS = (".csv", ".npz", ".parquet")  # In which tables are written.
-_READ = ".csv, .txt, .tsv, .dat (.gz), .npz, .mat, .parquet"
+_READ = ".csv, .txt, .tsv, .dat (.gz), .npz, .mat, .jsonl, .parquet"
 
 # More numbers than this are not kept in memory (320 MB): 3.6 h of 14 channels at
 # 200 Hz. Of a longer table, evenly spread stretches of rows are.
@@ -244,8 +243,7 @@ def _read_file(
         return _read_csv(path, most_cells, bad or BadRows(path, False), unused)
     if suffix == ".parquet":
         return _read_parquet(path, most_cells, unused)
-    read = read_npz if suffix == ".npz" else read_mat
-    columns, row, n, notes = read(path, most_cells, unused)
+    columns, row, n, notes = READERS[suffix](path, most_cells, unused)
     return replace(_columns_of(path, columns, row, n), notes=tuple(notes))
 
 

@@ -19,7 +19,7 @@ from makebreak.gap.data.match import AS_SAID, JointName, Match, plain_name
 from makebreak.gap.data.turns import TURN, without_turns
 
 DEG = np.pi / 180.0
-IN_DEGREES = "in degrees"
+BY_SIZE = "its size"
 FULL_RANGE = 100.5  # Per cent, from one end of a joint's range, or from its middle.
 _POSITIONS = ("position", "position_command")
 _ALIKE = 0.1  # Of a rate to a velocity that goes with it; a standard deviation:
@@ -392,7 +392,7 @@ def _chosen(groups, time: Match | None):
 def _position(each: _Columns, r: _Reading) -> Match:
     says = []
     if each.named[0] is None and r.q.factor != 1.0:
-        by = "its jumps" if each.jump == r.q.factor else "its size"
+        by = "its jumps" if each.jump == r.q.factor else BY_SIZE
         by = "the velocities" if r.q.cost >= _RARE and each.ratio else by
         says = [f"in {r.q.name}, by {by}"]
     if r.offset and r.offset == -r.q.zero * r.q.factor:
