@@ -22,6 +22,7 @@ from makebreak.gap.report.interactive import (
     expected_of,
     shown_series,
 )
+from makebreak.gap.report.markup import headline
 from makebreak.gap.report.pictures import picture_of_series, picture_of_where
 from makebreak.gap.report.sections import considered, evidence, series
 from makebreak.gap.report.summary import next_best, summary_lines
@@ -565,3 +566,13 @@ def test_errors_of_a_channel_with_rows_of_its_own_are_one_line_in_each_window():
     # Thirty rows, and one break: where the second window begins.
     assert np.isfinite(line).sum() == 30 and np.isnan(line).sum() == 1
     assert np.flatnonzero(np.isnan(line)).tolist() == [15]
+
+
+def test_a_long_text_is_no_heading():
+    short = "Joint a.b has Coulomb friction of 0.5 N m. The rest is noise."
+    assert headline(short).count("<h1>") == 1 and "<p>" not in headline(short)
+    parts = [f"joint a.j{i} has Coulomb friction of 0.{i} N m" for i in range(1, 7)]
+    html = headline(f"Out of time. It is off by 2.5 times: {'; '.join(parts)}. Wait.")
+    assert html.startswith("<h1>Out of time.</h1><p>It is off by 2.5 times:</p><ul>")
+    assert re.findall(r"<li>Joint a\.j(\d) [^<]*N&nbsp;m</li>", html) == list("123456")
+    assert html.endswith("</ul><p>Wait.</p>")

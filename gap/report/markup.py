@@ -1,6 +1,7 @@
 """Pieces of HTML that the report is made of, and its style sheet."""
 
 import base64
+import re
 from collections.abc import Mapping, Sequence
 from html import escape
 
@@ -9,6 +10,7 @@ import numpy as np
 from makebreak.gap.report.summary import number
 
 _MOST_ROWS = 200  # Of a table: a page with more is slow to open.
+_LONG = 240  # Characters of a heading.
 
 
 def sentence_html(sentence: str) -> str:
@@ -17,6 +19,22 @@ def sentence_html(sentence: str) -> str:
     for unit in ("N m", "kg m2", "rad/s", "N s/m"):  # A number keeps its unit.
         text = text.replace(f" {unit}", "&nbsp;" + unit.replace(" ", "&nbsp;"))
     return text
+
+
+def headline(says: str) -> str:
+    """What a result says, as a heading; of a long text the first sentence alone, then
+    the others, where more than two parts of one are a list."""
+    first, *others = re.split(r"(?<=\.) ", says) if len(says) > _LONG else [says]
+    html = f"<h1>{sentence_html(first)}</h1>"
+    for each in others:
+        lead, colon, rest = each.partition(": ")
+        parts = rest.rstrip(".").split("; ")
+        if colon and len(parts) > 2:
+            items = "".join(f"<li>{sentence_html(part)}</li>" for part in parts)
+            html += f"<p>{sentence_html(lead)}:</p><ul>{items}</ul>"
+        else:
+            html += f"<p>{sentence_html(each)}</p>"
+    return html
 
 
 def cell(value) -> str:

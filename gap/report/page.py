@@ -7,7 +7,7 @@ from pathlib import Path
 from makebreak.gap.data.recording import Recording
 from makebreak.gap.report import sections
 from makebreak.gap.report.interactive import shown_series
-from makebreak.gap.report.markup import STYLE, image, sentence_html
+from makebreak.gap.report.markup import STYLE, headline, image, sentence_html
 from makebreak.gap.report.summary import (
     closed_share,
     doubts,
@@ -74,7 +74,7 @@ def _first_screen(
     says = "Held-out error of each channel, before and after"
     parts = [
         f'<p class="badge" style="background:{colour}">{escape(heading)}</p>',
-        f"<h1>{sentence_html(result.says)}</h1>",
+        headline(result.says),
         _doubts(result),
         '<div class="two"><div>',
         *[_effect(each, result, i) for i, each in enumerate(result.effects)],
