@@ -9,6 +9,7 @@ import sysconfig
 import tarfile
 import venv
 import zipfile
+from datetime import datetime
 from email import message_from_bytes
 from pathlib import Path
 
@@ -99,6 +100,17 @@ def test_the_version_is_the_same_everywhere():
         assert line, name
         found[name] = line[1]
     assert len(set(found.values())) == 1, found
+
+
+def test_a_release_has_one_version_and_one_date():
+    """Those of the changelog's newest release."""
+    changes = (ROOT / "CHANGELOG.md").read_text()
+    version, date = re.findall(r"^## ([\d.]+) - (\S+)$", changes, re.M)[0]
+    day = datetime.strptime(date, "%Y-%m-%d")
+    notes = (ROOT / "docs/release_notes.md").read_text()
+    assert f"## {version} ({day.day} {day:%B %Y})" in notes
+    cited = (ROOT / "CITATION.cff").read_text()
+    assert f"version: {version}\ndate-released: {date}\n" in cited
 
 
 def test_the_page_of_the_index_has_no_link_that_leads_nowhere(archives):
