@@ -110,11 +110,21 @@ def problem_of(folder, arm, hidden):
     return problem
 
 
-def test_the_truth_leaves_the_noise(tmp_path):
-    hidden = [("joint_load_friction", "d", dict(share=0.3)),
-              ("servo_gain", "d", dict(kp=45.0))]  # fmt: skip
-    problem = problem_of(tmp_path, "two", hidden)
-    truth = with_effects(problem.scene, *hidden).effects
+HIDDEN = {
+    "two": [("joint_load_friction", "d", dict(share=0.3)),
+            ("servo_gain", "d", dict(kp=45.0))],
+    "four": [("joint_coulomb_friction", "p", dict(coulomb=0.4))],
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory):
+    return problem_of(tmp_path_factory.mktemp("two"), "two", HIDDEN["two"])
+
+
+def test_the_truth_leaves_the_noise(two):
+    problem = two
+    truth = with_effects(problem.scene, *HIDDEN["two"]).effects
     # Starts of joints that stick and slip are smoothed as if they moved smoothly.
     assert problem.noise_error(problem.residual(truth)) < 2.0
     assert problem.noise_error(problem.base()) > 5.0
@@ -128,13 +138,6 @@ def test_nothing_is_named_where_nothing_is_hidden(tmp_path, arm):
     result = run_gap(tmp_path / "scene.yaml", [tmp_path / "recording.csv"])
     assert result.effects == []
     assert result.verdict == "no_gap"
-
-
-HIDDEN = {
-    "two": [("joint_load_friction", "d", dict(share=0.3)),
-            ("servo_gain", "d", dict(kp=45.0))],
-    "four": [("joint_coulomb_friction", "p", dict(coulomb=0.4))],
-}  # fmt: skip
 
 
 @pytest.mark.slow
@@ -166,8 +169,8 @@ def test_what_all_joints_have_is_named_with_a_value_for_each(tmp_path, arm):
                 assert ours == pytest.approx(value, rel=0.15)
 
 
-def test_joints_are_moved_at_once_and_each_is_seen_in_its_own_rows(tmp_path):
-    problem = problem_of(tmp_path, "two", HIDDEN["two"])
+def test_joints_are_moved_at_once_and_each_is_seen_in_its_own_rows(two):
+    problem = two
     effects = [
         Effect("joint_load_friction", ["d.j1"], {"share": 0.2}),
         Effect("joint_load_friction", ["d.j2"], {"share": 0.2}),
@@ -186,12 +189,9 @@ def test_joints_are_moved_at_once_and_each_is_seen_in_its_own_rows(tmp_path):
         assert rms(off[own]) > 5.0 * rms(off[~own]), joint
 
 
-def test_equations_are_the_other_way_of_windows_and_the_reverse(tmp_path):
-    scene, file = recorded(tmp_path, "two", HIDDEN["two"])
-    recordings, dynamics = read_recordings([file]), SceneDynamics(scene)
-    windows, _ = problem_for(scene, recordings, dynamics)
-    assert isinstance(windows, DrivenProblem)
-    equations, _ = other_problem(windows, scene, recordings, dynamics, 1)
+def test_equations_are_the_other_way_of_windows_and_the_reverse(two):
+    scene, recordings, dynamics = two.scene, two.recordings, SceneDynamics(two.scene)
+    equations, _ = other_problem(two, scene, recordings, dynamics, 1)
     assert isinstance(equations, MechanismProblem)
     again, _ = other_problem(equations, scene, recordings, dynamics, 1)
     assert isinstance(again, DrivenProblem) and (again.misfit > 0.0).all()

@@ -117,17 +117,17 @@ def _axes_and_weight(dynamics: SceneDynamics, frame: Frame, q):
     plant, g = dynamics.plant, dynamics.gravity
     context = plant.CreateDefaultContext()
     beyond = [b for b in bodies_beyond(plant, frame.body()) if b.default_mass() > 0.0]
-    R, weight = np.empty((len(q), 3, 3)), np.zeros((len(q), 6))
+    parts = [(b, b.default_mass(), b.default_com()) for b in beyond]
+    R, lever = np.empty((len(q), 3, 3)), np.zeros((len(q), 3))  # [kg m]
     for k, row in enumerate(q):
         plant.SetPositions(context, row)
         X = frame.CalcPoseInWorld(context)
         R[k] = X.rotation().matrix()
-        for b in beyond:
-            own = b.default_mass() * g
-            com = plant.EvalBodyPoseInWorld(context, b).multiply(b.default_com())
-            weight[k, :3] += own
-            weight[k, 3:] += np.cross(com - X.translation(), own)
-    return R, weight
+        for b, mass, com in parts:
+            p = plant.EvalBodyPoseInWorld(context, b).multiply(com)
+            lever[k] += mass * (p - X.translation())
+    force = sum(mass for _, mass, _ in parts) * g
+    return R, np.column_stack([np.tile(force, (len(q), 1)), np.cross(lever, g)])
 
 
 def check_tool_weight(

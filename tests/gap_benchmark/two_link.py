@@ -24,7 +24,7 @@ _STEP = 1e-4
 _FADE = 1e-3  # [rad/s] over which dry friction turns round.
 
 
-@njit(cache=False)
+@njit(cache=True)
 def _terms(q1, q2, v1, v2, p):
     m1, c1x, c1z, i1, j1, m2, c2x, c2z, i2, j2, lx, lz, g = p[:13]
     s1, k1 = np.sin(q1), np.cos(q1)
@@ -45,7 +45,7 @@ def _terms(q1, q2, v1, v2, p):
     return m11, m12, m22, n1, n2
 
 
-@njit(cache=False)
+@njit(cache=True)
 def _acceleration(x, u1, u2, p):
     m11, m12, m22, n1, n2 = _terms(x[0], x[1], x[2], x[3], p)
     t1 = u1 - n1 - p[13] * np.tanh(x[2] / _FADE) - p[15] * x[2]
@@ -60,7 +60,7 @@ def _acceleration(x, u1, u2, p):
     return out
 
 
-@njit(cache=False)
+@njit(cache=True)
 def _hold(x, u1, u2, p, steps, h):
     """The state after `steps` under a constant effort."""
     for _ in range(steps):
