@@ -1127,6 +1127,32 @@ def json_lines(log: Log):
     return ("",)
 
 
+def with_units(text: str) -> str:
+    """Of SI, behind each number, and in a name without brackets."""
+    head, *rows = (line.split(",") for line in text.splitlines())
+    unit = {"position": "rad", "velocity": "rad/s", "effort": "Nm", "time": "s"}
+    units = [unit[name.split("_")[-1]] for name in head]
+    out = [",".join(f"{n} {u}" for n, u in zip(head, units, strict=True))]
+    for row in rows:
+        out.append(",".join(f"{x} {u}" for x, u in zip(row, units, strict=True)))
+    return re.sub(r"_(position|velocity|effort)", "", "\n".join(out)) + "\n"
+
+
+def in_tuples(log: Log):
+    def write(folder: Path, columns: dict) -> Path:
+        path = folder / "log.csv"
+        rows = ["time,q,dq,tau"]
+        for k, t in enumerate(log.time):
+            lists = [tuple(float(columns[n][k]) for n in names(log, w))
+                     for w in ("position", "velocity", "effort")]  # fmt: skip
+            rows.append(f"{t:.6f}," + ",".join(f'"{each}"' for each in lists))
+        path.write_text("\n".join(rows) + "\n")
+        return path
+
+    log.write = write
+    return ("",)
+
+
 def after_a_base(log: Log):
     """All coordinates, as MuJoCo and pinocchio have them."""
     still = {f"qpos_{k}": np.full(len(log.time), float(k == 3)) for k in range(7)}
@@ -1170,6 +1196,16 @@ KINDS |= {
         lambda text: text.replace("time", "Zeit", 1), ""
     ),
     "a list of texts beside": as_text(listed_beside, ""),
+    "dates of another order": as_text(
+        lambda text: re.sub(
+            r"(?m)^([\d.]+),",
+            lambda m: f"11/27/2026 22:00:{float(m[1]):09.6f},",
+            text,
+        ),
+        "",
+    ),
+    "cells in round brackets": in_tuples,
+    "units in cells and names": as_text(with_units, ""),
 }
 UNSEEN = list(KINDS)[list(KINDS).index("one velocity in degrees") :]
 

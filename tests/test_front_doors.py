@@ -249,6 +249,15 @@ def test_a_joint_without_a_command_beside_others_is_told(tmp_path):
     assert told[0] == [] and "what drives arm.joint2:" in told[1][0]
 
 
+def test_positions_that_count_from_the_logs_start_are_asked_about(tmp_path):
+    def from_start(columns):
+        for name in [n for n in columns if n.endswith("position")]:
+            columns[name] = columns[name] - columns[name][0]
+
+    found = judged(tmp_path, from_start)
+    assert "count from where the log" in found["position_from_start"]
+
+
 def test_efforts_of_another_motion_are_said_to_explain_nothing(tmp_path):
     def other(columns):
         for name in [n for n in columns if n.endswith("effort")]:

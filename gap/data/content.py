@@ -69,6 +69,8 @@ NO_WEIGHT = 0.02  # Of what an effort without weight leaves at most.
 LARGE, LARGER = 20.0, 3.0
 WITHOUT_WEIGHT = "effort_without_weight"
 UNSURE, LATE = "effort_unsure", "effort_late"
+FROM_A_START = "position_from_start"
+AT_ZERO = 1e-3  # [rad], [m]
 UNEXPLAINED = "effort_unexplained"
 _UNSURE = (
     "larger than the model needs, several times, and no rotor would do: another unit, "
@@ -79,6 +81,7 @@ _SEVERITY = {
     "too_short": "info",
     UNSURE: "warning",
     LATE: "warning",
+    FROM_A_START: "warning",
     UNEXPLAINED: "warning",
 }  # Else: an error.
 _DRIVES = ("effort_command", "effort_measured")
@@ -198,6 +201,7 @@ class Contents:
         self._all_time = time
         self.period = float(np.median(np.diff(self._time))) if len(q) > 1 else 0.0
         q = q[self._rows]
+        self.first = q[0] if len(q) else np.full(len(names), np.nan)
         averaged = averaged_motion(ServoLog(self._time, q, q)) if len(q) > 20 else None
         if averaged is None:
             raise TooShort("too short to tell what columns are by what is in them")
@@ -350,6 +354,7 @@ def by_content(
     matches = _with_factors(contents, matches, said)
     _unexplained(contents, matches, said)
     _late(contents, matches, said)
+    _from_a_start(contents, matches, said)
     return matches, said
 
 
@@ -814,6 +819,22 @@ def _unexplained(contents: Contents, matches, said) -> None:
             "its joints' order, and nothing pushes it?"
         )
         said.append(Said(UNEXPLAINED, contents.joints[off[0]].name, len(off), says))
+
+
+def _from_a_start(contents: Contents, matches, said) -> None:
+    """Says where positions may count from where the log begins, as incremental encoders
+    do: all begin at 0, and the efforts are others than there."""
+    efforts = _columns_of(contents, matches, _DRIVES)
+    moving = [i for i in range(len(contents.joints)) if contents.moves(i)]
+    if len(moving) < 2 or not (np.abs(contents.first[moving]) < AT_ZERO).all():
+        return
+    if efforts and _misfit(contents, efforts, True) > np.log(TOLD_WELL):
+        says = (
+            "All positions begin at 0, and the efforts are not those that the model "
+            "needs from there: do they count from where the log, or the robot, was "
+            "started? Then give each its offset in the sidecar."
+        )
+        said.append(Said(FROM_A_START, contents.joints[moving[0]].name, 0.0, says))
 
 
 def _late(contents: Contents, matches, said) -> None:

@@ -32,6 +32,8 @@ _STAMP = re.compile(
 )
 
 
+# A date whose order of day and month nobody can tell; the time of day is enough.
+_DAY = re.compile(rb"\b\d{1,4}[/.]\d{1,2}[/.]\d{2,4},? +(?=\d?\d:\d\d:\d\d)")
 # A time of day alone, or since a start.
 _CLOCK = re.compile(
     rb"(?<![\w:.-])(?:(\d+) days?,? )?([0-2]?\d):([0-5]\d):([0-5]\d)"
@@ -41,7 +43,8 @@ _CLOCK = re.compile(
 
 # A unit of SI behind a number, as MATLAB writes durations.
 _IN_SI = re.compile(
-    rb"(?<=\d) ?(?:sec|s|rad(?:/s)?|m(?:/s)?|N|N ?m)(?=[\"\s]*(?:[,;\t\r\n]|$))"
+    rb"(?m)((?:^|[,;\t])[\" ]*[+-]?\d[\d.]*(?:[eE][+-]?\d+)?)"
+    rb" ?(?:sec|s|rad(?:/s)?|m(?:/s)?|N|N ?m)(?=[\" ]*(?:[,;\t\r\n]|$))"
 )
 
 
@@ -242,7 +245,7 @@ def dialect_of(
     stamped = any(each.search(header + sample) for each in (_STAMP, _CLOCK, _IN_SI))
     lines = _in_seconds(sample).decode(errors="replace").splitlines()[:50]
     lists: dict[str, int] = {}
-    if "[" in "".join(lines):
+    if re.search(r"[\[(]", "".join(lines)):
         for cells in csv.reader(lines[:-1] or lines, delimiter=separator):
             if len(cells) != len(names):
                 continue
@@ -281,7 +284,9 @@ def _in_seconds(text: bytes) -> bytes:
         whole += int(rest)
         return b"%d.%s" % (whole, fraction or b"0")
 
-    return _IN_SI.sub(b"", _CLOCK.sub(of_day, _STAMP.sub(seconds, text)))
+    return _IN_SI.sub(
+        rb"\1", _CLOCK.sub(of_day, _DAY.sub(b"", _STAMP.sub(seconds, text)))
+    )
 
 
 def is_nameless(column: str) -> bool:
@@ -303,8 +308,9 @@ def _are_values(cells: Sequence[str], separator: str) -> bool:
 
 def _list(cell: str) -> list[float] | None:
     cell = cell.strip()
-    if not (cell.startswith("[") and cell.endswith("]")):
+    if (cell[:1], cell[-1:]) not in (("[", "]"), ("(", ")")):
         return None
+    cell = f"[{cell[1:-1]}]"
     try:
         return [float("nan") if v is None else float(v) for v in json.loads(cell)]
     except (ValueError, TypeError):

@@ -454,10 +454,11 @@ def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
     judged = judge_logs(robot, logs)
     robot, every, fixed = judged.robot, judged.every, judged.fixed
     kinds: dict[str, list[str]] = {}
-    for path, matches in every.items():
+    for log in logs:
+        path, matches = log.path, every[log.path]
         channels = {m.channel for m in matches if m.channel}
         if "time" not in channels:
-            named = [m.column for m in matches if is_time(m.column)]
+            named = [name for name in log.table.columns if is_time(name)]
             says = f" ({', '.join(named)}: {_STEPS})" if named else ""
             raise ValueError(
                 f"recording {path}: no column looks like a time{says}; name it in "
