@@ -571,8 +571,10 @@ def test_errors_of_a_channel_with_rows_of_its_own_are_one_line_in_each_window():
 def test_a_long_text_is_no_heading():
     short = "Joint a.b has Coulomb friction of 0.5 N m. The rest is noise."
     assert headline(short).count("<h1>") == 1 and "<p>" not in headline(short)
-    parts = [f"joint a.j{i} has Coulomb friction of 0.{i} N m" for i in range(1, 7)]
+    parts = [f"joint a.j{i} has Coulomb friction of 0.{i} N m" for i in range(1, 10)]
     html = headline(f"Out of time. It is off by 2.5 times: {'; '.join(parts)}. Wait.")
     assert html.startswith("<h1>Out of time.</h1><p>It is off by 2.5 times:</p><ul>")
-    assert re.findall(r"<li>Joint a\.j(\d) [^<]*N&nbsp;m</li>", html) == list("123456")
+    assert re.findall(r"<li>Joint a\.j(\d) [^<]*N&nbsp;m</li>", html) == list(
+        "123456789"
+    )
     assert html.endswith("</ul><p>Wait.</p>")

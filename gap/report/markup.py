@@ -10,7 +10,7 @@ import numpy as np
 from makebreak.gap.report.summary import number
 
 _MOST_ROWS = 200  # Of a table: a page with more is slow to open.
-_LONG = 240  # Characters of a heading.
+_LONG = 400  # Characters of a heading.
 
 
 def sentence_html(sentence: str) -> str:
