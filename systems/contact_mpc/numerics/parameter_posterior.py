@@ -135,7 +135,8 @@ def step_of(lcs: LCS, sample: Sample, loss: Loss):
     # A contact that pushes is closed at one end of the step at least: its row has the
     # smaller of the gaps there, instead of one that the end's velocity extrapolates.
     w = lcs.E @ x + lcs.H @ sample.u + lcs.c - pushes(lcs)[0] @ (sample.v_mean - v_now)
-    w -= 0.5 * abs(normal_speed(lcs, sample.v_mean)) + normal_speed(lcs, v_next)
+    normal = normals(lcs)
+    w -= 0.5 * abs(normal @ sample.v_mean) + normal @ v_next
     return lacks, w + opening_speed(lcs, sample.x_next, loss.slip_noise)
 
 
@@ -168,21 +169,13 @@ def impact_part(lcs: LCS, sample: Sample, lacks) -> float:
     whose bodies meet or part in the step: nothing while they move together."""
     n_v = sample.v_mean.size
     dv, energy = (sample.x_next - sample.x_now)[-n_v:], 0.0
-    for normal, _ in normals(lcs):
+    for normal in normals(lcs)[np.unique(pushes(lcs)[2], return_index=True)[1]]:
         if normal.any():
             mobility = normal @ np.linalg.solve(sample.M, normal)
             if mobility > 0.0:
                 energy = max(energy, (normal @ dv) ** 2 / mobility)
     whole = lacks[-n_v:] @ sample.M @ lacks[-n_v:]
     return float(min(energy / whole, 1.0)) if whole > 0.0 else 0.0
-
-
-def normal_speed(lcs: LCS, v) -> np.ndarray:
-    """(n_lam,) rate of each row's gap [m/s]; zero where w holds no gap."""
-    rate = np.zeros(lcs.n_lam)
-    for normal, rows in normals(lcs):
-        rate[rows] = normal @ v
-    return rate
 
 
 def pushes(lcs: LCS) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -192,13 +185,14 @@ def pushes(lcs: LCS) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return lcs.J, lcs.phi, lcs.contact
 
 
-def normals(lcs: LCS):
-    """(n_v,) what each contact's normal force pushes along, and its rows (n_lam,)."""
+def normals(lcs: LCS) -> np.ndarray:
+    """(n_lam, n_v) what the normal force of each row's contact pushes along; zero where
+    w holds no gap."""
     J, phi, contact = pushes(lcs)
-    for number in np.unique(contact):
-        rows = (contact == number) & np.isfinite(phi)
-        if rows.any():
-            yield J[rows].mean(axis=0), rows  # The edges come in opposite pairs.
+    with_gap = np.isfinite(phi)
+    same = (contact[:, None] == contact) & with_gap & with_gap[:, None]
+    # The edges come in opposite pairs.
+    return same @ J / np.maximum(same.sum(axis=1), 1)[:, None]
 
 
 def explain(lcs: LCS, sample: Sample, loss: Loss) -> Explained | None:
