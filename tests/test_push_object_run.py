@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from pydrake.systems.framework import DiagramBuilder
 
+from makebreak.benchmarks import parameter_push
 from makebreak.diagrams.camera import CameraConfig
 from makebreak.diagrams.push_object import (
     PushModelConfig,
@@ -366,3 +367,13 @@ def test_model_is_no_scene_here_and_says_so(capsys, tmp_path):
     words = ["run", "push_object", "--model", "scene.yaml", "--out", str(tmp_path)]
     assert main(words) == 2
     assert "--model: push_object has no model scene" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [5403, 5408])  # Friction double, mass half.
+def test_friction_times_mass_on_the_table_is_learned(seed):
+    """Within 10 % on 20 other seeds; 0.65 and 0.84 of the truth, as long as the learner
+    did not get the real contact force."""
+    learned = list(parameter_push.run(seed, "with").learned.values())
+    true = 1.0 / np.prod(list(parameter_push.case(seed)[1].values()))
+    assert learned[0] * learned[2] == pytest.approx(true, rel=0.12)
