@@ -32,7 +32,6 @@ from makebreak.gap.residuals.drive_gains import (
     gains_known_to,
     with_moved_gains,
 )
-from makebreak.gap.residuals.inverse import LOOP_SEC
 from makebreak.gap.residuals.mechanism import (
     LESS,
     MISFIT,
@@ -52,6 +51,7 @@ from makebreak.gap.result import Where
 from makebreak.gap.simulation.driven_arm import DrivenArmSimulation, can_have
 from makebreak.gap.simulation.measure import gap_measure, series_of, why_stopped
 from makebreak.gap.simulation.windows import LARGEST, WindowModel
+from makebreak.gap.thresholds import UNEXPLAINED_RMS
 from makebreak.models.drives import DRIVEN_BY, law_of
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.joints import rotor
@@ -76,6 +76,8 @@ UNKNOWN = 0.1
 SMALL = 0.1
 # Such a move, in deviations of what is known of a parameter beforehand.
 STEP_OF_PRIOR = 0.3
+# How late a drive's own loop may act: half a period of one at 1 kHz.
+LOOP_SEC = 5e-4
 # Units of the kinds that all joints have in a rich model.
 RICH = ("N m", "N m s/rad", "N m/rad", "kg m2")
 OWN = 0.02  # Of a column, what is no sum of those before it: less says the same.
@@ -83,6 +85,7 @@ LAW = 0.1  # Of such a step: what is smaller may be the law's own error.
 # With which friction may stop joints (DrivenArmScene): of robots, and of MuJoCo's
 # solver as it comes. By how much of the error the second must be better.
 CREEP_SEC, CREEPS = (0.0, 0.001), 0.05
+HALF = 0.5  # Of what a rich model leaves: a wider kind must leave less.
 RICH_STEPS = 16  # Gauss-Newton steps of the fit of all that a joint may have.
 # Columns of links are taken again where they are off by this, over what rows are
 # divided by, so many times at most.
@@ -227,18 +230,28 @@ class DrivenProblem(DrivenWindows, GapProblem):
 
     def is_explained(self) -> bool:
         """Whether the scene as it came, its background within its tolerance, explains
-        each channel's windows as well as noise lets it."""
+        windows as well as noise lets it, and leaves no gap at any channel."""
         if self._explained is None:
             self._set_creep(self._best_creep(self._error_with))
-            n = self.nuisances()
-            screen = Screen(
-                self.base(), n.columns, n.prior, self.train(), reach=n.reach
-            )
-            left = self.in_noise(screen.fit_nuisances(self.base())[1])
-            channel = self.channel_of_rows()
+            unknown = self.misfit
+            for _ in range(MOST_MOVES):
+                n = self.nuisances()
+                screen = Screen(
+                    self.base(), n.columns, n.prior, self.train(), reach=n.reach
+                )
+                left = screen.fit_nuisances(self.base())[1]
+                less = np.minimum(self._misfit_of(left), self.misfit)
+                if (less >= LESS * self.misfit).all():
+                    break
+                # A weak joint's links are off by much that they explain themselves.
+                self.misfit, self._base, self._nuisances = less, None, None
+                self._move_links()
+            channel, left = self.channel_of_rows(), self.in_noise(left)
             each = [left[channel == c] for c in np.unique(channel)]
-            self._explained = all(rms(x) < MISFIT for x in each)
+            most = max(rms(x) for x in each)
+            self._explained = rms(left) < MISFIT and most < UNEXPLAINED_RMS
             if not self._explained:  # They are seen beside a rich model.
+                self.misfit = unknown
                 self._forget_nuisances()
         return self._explained
 
@@ -261,7 +274,7 @@ class DrivenProblem(DrivenWindows, GapProblem):
         creep_sec = self._best_creep(error_of)
         self._set_creep(creep_sec)
         screen = Screen(self.base(), n.columns, n.prior, self.train())
-        rich = fits[creep_sec]
+        rich = self._with_wider(fits[creep_sec], screen)
         left = rich.r
         if rich.fit.train > screen.evaluate(self.base()).train:  # It went astray.
             left = self.base()
@@ -271,6 +284,28 @@ class DrivenProblem(DrivenWindows, GapProblem):
         self.correlation = self._correlation_of(left)
         self._base = None
         self.nuisances()  # Links may move, and the scene's rows with them.
+
+    def _with_wider(self, rich: Fitted, screen: Screen) -> Fitted:
+        """The rich model with kinds that change with the motion at those joints of
+        which they at least halve what it leaves of held-out rows. (Elsewhere they would
+        stand for what it lacks: a load's weight, a friction that grows with effort.)"""
+        every = [e for small in self._small_between() for e in small]
+
+        def fitted(some: Sequence[Effect]) -> Fitted:
+            effects = [*rich.effects, *some]
+            return fit_effects(self, screen, effects, evaluations=RICH_STEPS)
+
+        try:
+            wide = fitted(every) if every else rich
+        except ValueError:
+            return rich
+        held = ~self.train()
+        kept = [
+            e for e in every
+            for mine in [held & self._rows_of(e.at[0])]
+            if rms(wide.r[mine]) < HALF * rms(rich.r[mine])
+        ]  # fmt: skip
+        return fitted(kept) if kept else rich
 
     def prior_rows(self, effects: Sequence[Effect]) -> np.ndarray:
         """Of what several parameters of a joint can do alike none is large: each is
@@ -294,7 +329,7 @@ class DrivenProblem(DrivenWindows, GapProblem):
         found: list[Effect] = []
         basis: dict[str, np.ndarray] = {}
         base = self.base()
-        for small in [*self._small(), *self._small_between()]:
+        for small in self._small():
             try:
                 off = self.residual(small) - base
             except ValueError:

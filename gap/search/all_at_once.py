@@ -12,7 +12,7 @@ from makebreak.gap.fit import fit_effects
 from makebreak.gap.problem import Fitted, rms
 from makebreak.gap.search.choice import Choice, refreshed
 from makebreak.gap.search.comparison import Comparison
-from makebreak.gap.thresholds import SAME_ERROR
+from makebreak.gap.thresholds import NOISE_RMS_MAX, SAME_ERROR
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 
@@ -87,12 +87,22 @@ def _in_place_of_contained(
     search: Comparison, fit: Fitted, kind: str, most: np.ndarray
 ) -> Fitted:
     """Where effects of a kind stay, those that it contains go: it says both."""
-    at = {tuple(e.at) for e in fit.effects if e.kind == kind}
-    inside = KINDS[kind].contains
-    some = [e for e in fit.effects if not (e.kind in inside and tuple(e.at) in at)]
-    if len(some) == len(fit.effects):
+    wide = {tuple(e.at): e for e in fit.effects if e.kind == kind}
+    some = []
+    for e in fit.effects:
+        if e.kind in KINDS[kind].contains and tuple(e.at) in wide:
+            ((_, value),) = e.parameters.items()
+            of = wide[tuple(e.at)]
+            sums = {
+                p.name: of.parameters[p.name] + (0.0 if p.given else value)
+                for p in KINDS[kind].parameters
+            }
+            wide[tuple(e.at)] = Effect(kind, of.at, sums)
+        elif e.kind != kind:
+            some.append(e)
+    if len(some) + len(wide) == len(fit.effects):
         return fit
-    less = _fit(search, some)
+    less = _fit(search, [*some, *wide.values()])
     return fit if less is None or (_errors(search, less) > most).any() else less
 
 
@@ -114,8 +124,9 @@ def _fit(
 
 
 def _errors(search: Comparison, fit: Fitted) -> np.ndarray:
-    """(n_channels,) rms of held-out rows."""
+    """(n_channels,) rms of held-out rows; what a right model may leave is none."""
     held = ~search.train
-    return np.array(
-        [rms(fit.left[held & (search.channel == c)]) for c in np.unique(search.channel)]
-    )
+    each = [
+        rms(fit.left[held & (search.channel == c)]) for c in np.unique(search.channel)
+    ]
+    return np.maximum(each, NOISE_RMS_MAX)
