@@ -156,7 +156,9 @@ def test_a_proposal_fixes_a_grippers_fingers(logged, right, fixed, tmp_path):
         assert FIXED not in {f.kind for f in proposal.findings()}
         return
     assert f"fixed_joints: {fixed}" in proposal.scene
-    assert [f.kind for f in proposal.findings()] == [FIXED]
+    # (The log's efforts are made up, which is said, too.)
+    kinds = [f.kind for f in proposal.findings()]
+    assert FIXED in kinds and set(kinds) <= {FIXED, "effort_unexplained"}
     (sidecar,) = proposal.sidecars.values()
     assert sidecar.count("taken to stand still") == (2 if "left" in logged else 0)
     path = tmp_path / "proposed.yaml"
