@@ -116,14 +116,10 @@ def _vetoes(
             )
     if found:
         return [(choices[k], why) for k, why in found.items()]
-
-    def at(choice: Choice, channel: str) -> bool:
-        return acts_on(problem, choice.effect, channel.rsplit(".", 1)[0])
-
     return [
         (choice, not_confirmed(gap))
         for choice in choices
-        if not is_confirmed(gap, partial(at, choice))
+        if not is_confirmed(gap, partial(acts_on_channel, problem, choice.effect))
     ]
 
 
@@ -287,6 +283,11 @@ def acts_on(problem: GapProblem, effect: Effect, place: str) -> bool:
             if place.startswith(f"{one}.") or _moves(problem, place, one):
                 return True
     return False
+
+
+def acts_on_channel(problem: GapProblem, effect: Effect, channel: str) -> bool:
+    """The same of a channel of a joint or body."""
+    return acts_on(problem, effect, channel.rsplit(".", 1)[0])
 
 
 def _moves(problem: GapProblem, joint: str, body: str) -> bool:

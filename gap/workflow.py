@@ -24,7 +24,7 @@ from makebreak.gap.by_recording import (
     may_differ,
     with_differences,
 )
-from makebreak.gap.confirm import acts_on, confirmed, judge_of
+from makebreak.gap.confirm import acts_on_channel, confirmed, judge_of
 from makebreak.gap.data import sampled_commands
 from makebreak.gap.data.channel_noise import in_newton_metres
 from makebreak.gap.data.check_drives import (
@@ -651,7 +651,7 @@ def _withdrawn(
         closed = problem.closed(selection.start, selection.end)
     return too_weak(
         facts, closed,
-        lambda c, channel: acts_on(problem, c.effect, channel.rsplit(".", 1)[0]),
+        lambda c, channel: acts_on_channel(problem, c.effect, channel),
     )  # fmt: skip
 
 

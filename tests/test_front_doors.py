@@ -1,6 +1,8 @@
 """Logs with one wrong thing each: it is said, and no mass has to make up for it."""
 
+from csv import reader
 from dataclasses import replace
+from io import BytesIO
 
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ from front_doors import KINDS, ROBOTS, exact, one
 
 from makebreak.gap.data.content import check_contents, likeness
 from makebreak.gap.data.reading import read_recording, read_recordings
+from makebreak.gap.data.reshaped import reshaped
 from makebreak.gap.data.robot import propose_scene, read_log, read_robot
 from makebreak.gap.data.table import write_recording
 from makebreak.gap.data.turns import without_turns
@@ -290,3 +293,31 @@ def test_efforts_in_parts_of_unknown_ratings_are_asked_about(tmp_path):
 
     found = judged(tmp_path, rated)
     assert "joint2_effort, joint3_effort: larger" in found["effort_unsure"]
+
+
+LONG = "time,joint,position\n"
+
+
+@pytest.mark.parametrize(
+    "rows, is_long",
+    [
+        # Two rows of one instant.
+        (['0,"a, b",1', "0,c,2", '1,"a, b",3', "1,c,4", "2,c,5"], True),
+        # Each row at an instant of its own, names in turns; too few of them to tell.
+        ([f"{k},{'ab'[k % 2]},{k}" for k in range(8)], True),
+        ([f"{k},{'ab'[k % 2]},{k}" for k in range(6)], False),
+        ([f"{k},{'aab'[k % 3]},{k}" for k in range(12)], False),
+    ],
+)
+def test_a_row_for_each_joint_becomes_a_column_for_each(rows, is_long):
+    file = BytesIO((LONG + "\n".join(rows) + "\n").encode())
+    wide = reshaped(file)
+    if not is_long:
+        assert wide is None and file.tell() == 0
+        return
+    names, *table = reader(wide.read().decode().splitlines())
+    label = next(reader(rows[:1]))[1]
+    assert names[:2] == ["time", f"{label}/position"] and len(names) == 3
+    for row in reader(rows):
+        own = next(each for each in table if each[0] == row[0])
+        assert own[names.index(f"{row[1]}/position")] == row[2]

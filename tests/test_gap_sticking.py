@@ -130,6 +130,23 @@ def test_the_truth_leaves_the_noise(two):
     assert problem.noise_error(problem.base()) > 5.0
 
 
+def test_gains_are_known_to_a_share_and_friction_to_one_of_the_effort(two):
+    """Gains to three times 2 %; friction as long as it is no more than laws are off."""
+    for kp, is_within in (
+        (60.0 * 1.05, True),
+        (60.0 * 0.95, True),
+        (60.0 * 1.07, False),
+    ):
+        gain = Effect("servo_gain", ["d.j1"], {"kp": kp})
+        assert two.is_within_tolerance(gain) == is_within
+    for coulomb, is_within in ((1e-3, True), (0.5, False)):
+        friction = Effect("joint_coulomb_friction", ["d.j2"], {"coulomb": coulomb})
+        assert two.is_within_tolerance(friction) == is_within
+        ends = dict(coulomb_low=0.0, coulomb_high=coulomb, low=-0.3, high=0.3)
+        between = Effect("joint_position_friction", ["d.j2"], ends)
+        assert two.is_within_tolerance(between) == is_within
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("arm", ARMS)
 def test_nothing_is_named_where_nothing_is_hidden(tmp_path, arm):

@@ -92,14 +92,21 @@ def ticks(before: np.ndarray, after: np.ndarray) -> np.ndarray | None:
     return np.minimum(start + latest.x[0] + latest.x[1] * k, after)
 
 
+def changes(held: np.ndarray) -> np.ndarray:
+    """(n,) whether a command (n,), NaN before its first value, is another one than in
+    the row before."""
+    before = np.concatenate([[np.nan], held[:-1]])
+    return np.isfinite(held) & (held != before)
+
+
 def _instants(recording: Recording, episode: Episode, names: Sequence[str]):
     """(the rows' times at which commands changed, when they did) (n,) each; None where
     that is not known better."""
     time = recording.time[episode.rows]
     if not names or len(time) < 3:
         return None
-    held = np.stack([recording.held(name)[episode.rows] for name in names], axis=1)
-    changed = 1 + np.flatnonzero((np.diff(held, axis=0) != 0.0).any(axis=1))
+    each = [changes(recording.held(name)[episode.rows]) for name in names]
+    changed = 1 + np.flatnonzero(np.any(each, axis=0)[1:])
     found = ticks(time[changed - 1], time[changed])
     return None if found is None else (time[changed], found)
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from makebreak.gap.data.channel_noise import with_noise
 from makebreak.gap.data.clock import clock_period, even_clock
-from makebreak.gap.data.command_clock import on_command_clock
+from makebreak.gap.data.command_clock import changes, on_command_clock
 from makebreak.gap.data.filters import FILTERED_SEC
 from makebreak.gap.data.findings import Finding
 from makebreak.gap.data.recording import Channel, Episode, Recording, unit_of
@@ -292,7 +292,7 @@ def _blocks(recording: Recording, episode: Episode, length: float, fast):
         c for c in recording.measured() if c.name not in fast
     ]  # Each at its own stamps.
     held = {c.name: recording.held(c.name)[episode.rows] for c in recording.commands()}
-    changed = {name: _changes(x) & (block < n) for name, x in held.items()}
+    changed = {name: changes(x) & (block < n) for name, x in held.items()}
     # (What an effort does follows from its mean; a loop's gains would seem smaller.)
     rare = {
         name for name, x in changed.items()
@@ -323,12 +323,6 @@ def _blocks(recording: Recording, episode: Episode, length: float, fast):
             column[np.searchsorted(every, time[there])] = y[there]
         out[name] = column
     return out
-
-
-def _changes(held: np.ndarray) -> np.ndarray:
-    """(n,) whether a command is another one than in the row before."""
-    before = np.concatenate([[np.nan], held[:-1]])
-    return np.isfinite(held) & (held != before)
 
 
 def _mean_of_held(time, held, starts, length) -> np.ndarray:

@@ -84,4 +84,6 @@ def _wide(text: bytes, of: int) -> BytesIO:
     for at, own in instants.items():
         cells = (own.get(label, none)[k] for label in labels for k in rest)
         out.append([at, *cells])
-    return BytesIO("\n".join(",".join(row) for row in out).encode() + b"\n")
+    text_out = StringIO()
+    csv.writer(text_out, lineterminator="\n").writerows(out)
+    return BytesIO(text_out.getvalue().encode())

@@ -7,7 +7,7 @@ motion mislead. Here windows are simulated by compiled code
 would do is seen by differences.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -289,7 +289,7 @@ class DrivenProblem(DrivenWindows, GapProblem):
         """The rich model with kinds that change with the motion at those joints of
         which they at least halve what it leaves of held-out rows. (Elsewhere they would
         stand for what it lacks: a load's weight, a friction that grows with effort.)"""
-        every = [e for small in self._small_between() for e in small]
+        every = self._wider()
 
         def fitted(some: Sequence[Effect]) -> Fitted:
             effects = [*rich.effects, *some]
@@ -329,7 +329,11 @@ class DrivenProblem(DrivenWindows, GapProblem):
         found: list[Effect] = []
         basis: dict[str, np.ndarray] = {}
         base = self.base()
-        for small in self._small():
+        for kind, name, each in self._at_joints():
+            if KINDS[kind].channel or KINDS[kind].parameter(name).unit not in RICH:
+                continue
+            moved = {joint: x + step for joint, (x, step) in each.items() if step}
+            small = [Effect(kind, [j], {name: x}) for j, x in moved.items()]
             try:
                 off = self.residual(small) - base
             except ValueError:
@@ -345,30 +349,21 @@ class DrivenProblem(DrivenWindows, GapProblem):
                     found.append(effect)
         return found
 
-    def _small(self) -> Iterator[list[Effect]]:
-        """Of each kind with one parameter, small effects at all joints."""
-        for kind, name, each in self._at_joints():
-            if KINDS[kind].channel or KINDS[kind].parameter(name).unit not in RICH:
-                continue
-            moved = {joint: x + step for joint, (x, step) in each.items() if step}
-            yield [Effect(kind, [j], {name: x}) for j, x in moved.items()]
-
-    def _small_between(self) -> Iterator[list[Effect]]:
-        """The same of kinds that change with what the motion gives: small where the
-        first of their parameters holds."""
-        motions = self._motions()
+    def _wider(self) -> list[Effect]:
+        """Small effects of kinds that change with what the motion gives, at all joints:
+        small where the first of their parameters holds."""
+        motions, found = self._motions(), []
         for kind, entry in KINDS.items():
             names = [p.name for p in entry.parameters if not p.given]
             if len(names) == len(entry.parameters) or entry.at not in JOINTS:
                 continue
-            small = []
             for joint in self.dynamics.places(kind):
                 for held in values_tried(kind, joint, self.dynamics.plant, motions):
                     p = dict.fromkeys(names, 0.0) | held
                     unit = entry.parameter(names[0]).unit
                     p[names[0]] = self._step(unit, 0.0, joint)
-                    small.append(Effect(kind, [joint], p))
-            yield small
+                    found.append(Effect(kind, [joint], p))
+        return found
 
     def _motions(self) -> list[Motion]:
         """The smoothed motion of each episode."""
