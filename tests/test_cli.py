@@ -387,7 +387,7 @@ def wait_for(paths):
         (signal.SIGINT, False),
         (signal.SIGINT, True),
         (signal.SIGTERM, False),
-        (signal.SIGHUP, False),
+        pytest.param(signal.SIGHUP, False, marks=pytest.mark.slow),
     ],
 )
 def test_ctrl_c_ends_a_run_cleanly_and_keeps_what_was_recorded(

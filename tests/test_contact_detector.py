@@ -185,7 +185,7 @@ def random_impacts(rng, count, free):
 def test_hundreds_of_impacts_are_each_felt_once_at_their_place(free):
     rng = np.random.default_rng(1)
     place, late, speed, error = [], [], [], []
-    for world in random_impacts(rng, 200, free):
+    for world in random_impacts(rng, 100, free):
         rows, touch = run(world), world.touch()
         assert rows[touch - 1, MADE] == 0
         assert rows[-1, MADE] == 1 and rows[-1, MEASURED] == 1

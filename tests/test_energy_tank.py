@@ -77,7 +77,7 @@ def test_energy_never_grows_by_more_than_the_tank_and_the_work_from_outside(
     tip.tick(wanted)
     start, tip.from_outside = tip.energy(), 0.0
     every, force = int(rng.integers(1, 400)), np.zeros(axes)
-    for k in range(2000):
+    for k in range(1000):
         if profile == "worst":
             wanted = worst(tip)
         elif profile == "periodic":

@@ -57,6 +57,7 @@ def test_an_own_learner_takes_the_place_of_ours_in_an_experiment(tmp_path):
     assert result["multibody_residual_error_max"] < 0.05
 
 
+@pytest.mark.slow
 def test_a_sweep_says_how_far_a_wrong_mass_matters():
     # ... "within 1 cm: 8 of 8, 68-100 %".
     *rows, _, reached, of, low, high = map(abs, numbers("sweep_a_puck.py"))
@@ -121,6 +122,7 @@ def test_the_gantry_lands_gently_the_second_time():
     assert slower < 0.5 * speed and gentler == pytest.approx(8.0, abs=1.0)
 
 
+@pytest.mark.slow
 def test_the_friction_that_an_arm_has_and_its_urdf_has_not_is_named(tmp_path):
     # 0.2 N m in the second joint; the interval is of one deviation.
     says = printed("gap_of_an_arm.py", str(tmp_path)).splitlines()[0]
@@ -129,6 +131,7 @@ def test_the_friction_that_an_arm_has_and_its_urdf_has_not_is_named(tmp_path):
     assert "Coulomb friction" in (tmp_path / "report" / "report.html").read_text()
 
 
+@pytest.mark.slow
 def test_the_friction_that_thrown_balls_show_is_named():
     friction, deviation = numbers("gap_of_an_object.py")
     # Of discrete steps in the world, and none in what is fitted.

@@ -208,7 +208,11 @@ DAMPED = [Effect("joint_viscous_damping", ["panda"], {"damping": 8.0})]
 DRY = [Effect("joint_coulomb_friction", ["panda"], {"coulomb": 3.0})]
 
 
-@pytest.mark.parametrize("world", [DAMPED, DRY, DAMPED + DRY], ids=str)
+@pytest.mark.parametrize(
+    "world",
+    [*(pytest.param(e, marks=pytest.mark.slow) for e in (DAMPED, DRY)), DAMPED + DRY],
+    ids=str,
+)
 def test_an_arm_with_friction_that_the_model_has_tracks_as_one_without(plant, world):
     model = read_scene(TABLETOP_WALLS)
     set_tool(model, "sphere")

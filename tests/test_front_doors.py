@@ -26,7 +26,7 @@ def test_what_is_wrong_with_a_log_is_said_and_put_right(tmp_path, kind):
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_of_a_log_that_is_right_nothing_is_said(tmp_path, robot, seed):
     _, right, found = one("semicolons and commas", robot, seed, tmp_path)
     assert right

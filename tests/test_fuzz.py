@@ -358,8 +358,8 @@ def fuzz(examples: int, only_reads: bool, experiments):
     return tried
 
 
-def test_sixty_wrong_inputs_are_runs_or_one_line():
-    fuzz(60, True, ["multi_spring"])()  # The others compile for a minute.
+def test_thirty_wrong_inputs_are_runs_or_one_line():
+    fuzz(30, True, ["multi_spring"])()  # The others compile for a minute.
 
 
 def test_what_came_before_is_a_run():

@@ -201,7 +201,7 @@ def command(words, cwd, until: str = "", then=(), timeout=120.0):
     ("stage", "number"),
     [
         ("reading", signal.SIGINT),
-        ("preparing", signal.SIGTERM),
+        pytest.param("preparing", signal.SIGTERM, marks=pytest.mark.slow),
         ("searching", signal.SIGINT),
     ],
 )

@@ -126,8 +126,8 @@ def rotation(q):
     return np.array(R).transpose(2, 0, 1)
 
 
-def test_clean_flights_of_50_seeds_raise_no_finding(tmp_path):
-    for seed in range(50):
+def test_clean_flights_of_20_seeds_raise_no_finding(tmp_path):
+    for seed in range(20):
         assert findings(tmp_path, falling(seed)) == []
 
 

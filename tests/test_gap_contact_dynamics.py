@@ -73,7 +73,7 @@ def fitted(model: ContactDynamics, kind: str, at: str, start: dict, names) -> di
 
 
 @pytest.mark.parametrize("sign", [pytest.param(-1.0, marks=pytest.mark.slow), 1.0])
-@pytest.mark.parametrize("wrench", [True, False])
+@pytest.mark.parametrize("wrench", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_friction_is_measured_by_what_forces_cannot_explain(tmp_path, sign, wrench):
     scene, recordings, truth = pushed(
         tmp_path, 11, ["contact_friction"], sign, wrench=wrench
@@ -110,6 +110,7 @@ def test_tilt_of_the_table_is_measured(tmp_path):
     assert after < 0.6 * before
 
 
+@pytest.mark.slow
 def test_camera_noise_does_not_pull_the_mass_down(tmp_path, monkeypatch):
     """Noise of the pose is in what the mass multiplies. With the expected acceleration
     in its place (regression calibration), and rows weighed by the mass that is tried,
@@ -236,6 +237,7 @@ def test_a_pose_without_orientation_is_refused(tmp_path):
         ContactDynamics(scene, [blind])
 
 
+@pytest.mark.slow
 def test_a_side_of_a_patch_that_nothing_crosses_is_said_not_to_be_known(tmp_path):
     """The patch reaches far beyond where the block is pushed on one side."""
     rng = np.random.default_rng(18)
@@ -421,6 +423,7 @@ def test_a_force_sensor_that_is_read_with_the_commands_sees_their_ripple(
     assert off() < -0.005
 
 
+@pytest.mark.slow
 def test_a_rail_s_friction_is_that_of_a_joint_that_moves(tmp_path, monkeypatch):
     """While a motion sets in or ends within a mean, the mean of the friction is not
     the friction at the mean velocity; and at rest friction is anything. Each taken
@@ -880,7 +883,9 @@ def test_what_a_planar_camera_says_of_the_height_is_not_compared(tmp_path):
     assert np.sqrt(np.mean(errors**2)) < 1.2
 
 
-@pytest.mark.parametrize("measured", [True, False])
+@pytest.mark.parametrize(
+    "measured", [True, pytest.param(False, marks=pytest.mark.slow)]
+)
 def test_noise_of_an_effort_is_that_of_positions_and_of_velocities(tmp_path, measured):
     """Of a drive that damps: kd times a velocity is most of what noise makes of it."""
     scene, recordings, _ = pushed(tmp_path, 16, [], episodes=2)

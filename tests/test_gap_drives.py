@@ -1,6 +1,7 @@
 """Recordings of joints whose drives have a loop of their own, and what they lack."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -90,12 +91,17 @@ def rms(r):
     return float(np.sqrt(np.mean(r**2)))
 
 
+QUICK = (
+    ("servo", "nothing"),
+    ("servo", "load and more"),
+    ("velocity", "load and more"),
+)
+
+
 @pytest.mark.parametrize(
     "drive, hidden",
-    [("servo", hidden) for hidden in HIDDEN]
-    + [("velocity", "load and more")]
-    + [pytest.param("velocity", hidden, marks=pytest.mark.slow)
-       for hidden in ("nothing", "load", "direction")],
+    [pytest.param(*each, marks=[pytest.mark.slow] * (each not in QUICK))
+     for each in product(("servo", "velocity"), HIDDEN)],
 )  # fmt: skip
 def test_equations_of_driven_joints_are_met_by_the_truth_alone(tmp_path, drive, hidden):
     effects = HIDDEN[hidden]

@@ -82,7 +82,7 @@ def test_of_four_trials_the_last_is_held_out_and_not_the_end_of_each(
 @pytest.mark.parametrize(
     ("make_files", "spoil"),
     [
-        (mechanism, noise),
+        pytest.param(mechanism, noise, marks=pytest.mark.slow),
         pytest.param(rolling, shrunk, marks=pytest.mark.slow),
         (touching, shrunk),
     ],

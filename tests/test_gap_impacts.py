@@ -179,7 +179,7 @@ def test_velocities_that_come_late_are_no_softer_wall(tmp_path):
         pytest.param(4, 0, marks=pytest.mark.slow),
         (2, 2),
         (1, 0),
-        (2, 5),
+        pytest.param(2, 5, marks=pytest.mark.slow),
     ],
 )
 def test_commands_of_a_faster_loop_act_where_free_motion_says(tmp_path, rows, shift):
@@ -322,6 +322,7 @@ def test_a_wall_that_stands_elsewhere_is_found_by_what_runs_against_it(tmp_path)
     assert np.sqrt(np.mean(end.r**2)) < 1.1 < np.sqrt(np.mean(start.r**2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("times", [1.0, pytest.param(10.0, marks=pytest.mark.slow)])
 def test_a_soft_bumper_that_is_struck_is_not_pressed_on(tmp_path, times):
     """A strike goes deeper than a tool that presses may be in a face. It goes so deep

@@ -213,9 +213,8 @@ def test_a_hole_that_stands_elsewhere_was_passed_through_the_walls_that_are_open
     assert off == pytest.approx({"x": 2.59e-3, "y": -5.71e-3}, abs=1e-4)
 
 
-@pytest.mark.parametrize(
-    "seed, y", [(15, 6.89e-3), pytest.param(20, -5.11e-3, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("seed, y", [(15, 6.89e-3), (20, -5.11e-3)])
 def test_a_wall_stands_where_what_is_pushed_meets_it(tmp_path, seed, y):
     """Farther away it was gone through; nearer nothing touches it in the scene."""
     problem = problem_of(tmp_path, ContactProblem, "corner", seed, most=1, hide="wall")

@@ -29,9 +29,9 @@ def found_in(folder, recipe, seed):
     "robot, option",
     [
         ("planar", "first order"),
-        ("planar", "moving average"),
         ("planar", "wander"),
-        ("six", "velocity drive"),
+        pytest.param("planar", "moving average", marks=pytest.mark.slow),
+        pytest.param("six", "velocity drive", marks=pytest.mark.slow),
     ],
 )
 def test_what_sensors_and_drives_do_is_no_gap(tmp_path, robot, option):
@@ -44,6 +44,7 @@ def test_what_sensors_and_drives_do_is_no_gap(tmp_path, robot, option):
     assert ("is taken for noise of the sensors" in result.says) == (option == "wander")
 
 
+@pytest.mark.slow
 def test_slow_noise_of_one_effort_does_not_hide_what_is_missing_at_another(tmp_path):
     """As in a log of a real double pendulum: the equation of the shoulder is not met,
     by more than its sensor could make; windows that expect what is left of the elbow's

@@ -98,7 +98,7 @@ def scene(tmp_path):
     return path
 
 
-@pytest.mark.parametrize("late", [0.003, 0.02])
+@pytest.mark.parametrize("late", [0.003, pytest.param(0.02, marks=pytest.mark.slow)])
 def test_late_states_are_named_beside_the_efforts(scene, tmp_path, late):
     result = run_gap(scene, [log(tmp_path, "a", 0, late=late)])
     assert result.verdict == "gap_named"

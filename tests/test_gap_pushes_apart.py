@@ -29,7 +29,8 @@ from makebreak.models.scene import read_scene
 test_functions.__test__ = False  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize("scale", [pytest.param(0.93, marks=pytest.mark.slow), 1.06])
+@pytest.mark.slow
+@pytest.mark.parametrize("scale", [0.93, 1.06])
 def test_an_object_s_size_is_measured_by_where_it_is_pushed(tmp_path, scale):
     """The block is so many times as large as the scene's, with the same mass."""
     rng = np.random.default_rng(71)
@@ -270,7 +271,8 @@ def test_a_block_of_one_moment_is_less_loud_than_one_of_many():
     assert one == pytest.approx(4.0 * np.sqrt(1 / 2))
 
 
-@pytest.mark.parametrize("factor", [0.4, pytest.param(2.5, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [0.4, 2.5])
 def test_a_friction_far_off_is_guessed_by_steps_as_far(tmp_path, factor):
     """What more friction changes ends where the tip sticks: by small steps half of what
     is missing is found."""

@@ -206,6 +206,7 @@ def test_joints_are_moved_at_once_and_each_is_seen_in_its_own_rows(two):
         assert rms(off[own]) > 5.0 * rms(off[~own]), joint
 
 
+@pytest.mark.slow
 def test_equations_are_the_other_way_of_windows_and_the_reverse(two):
     scene, recordings, dynamics = two.scene, two.recordings, SceneDynamics(two.scene)
     equations, _ = other_problem(two, scene, recordings, dynamics, 1)

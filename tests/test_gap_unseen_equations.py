@@ -63,6 +63,7 @@ def test_the_true_friction_leaves_noise_where_nothing_was_fitted(pushes):
     assert tip == ["N"] * len(tip)  # It slides.
 
 
+@pytest.mark.slow
 def test_nothing_is_learned_of_unseen_recordings(pushes, monkeypatch):
     """Not what models are off by, nor the place of the camera."""
     problem, start, end, _, unseen = pushes

@@ -64,12 +64,10 @@ def test_a_hidden_effect_is_named_and_measured(tmp_path, name, parameter, tolera
     assert result.where
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
-    [
-        "28_pendulum_actuator_gain",
-        pytest.param("38_pendulum_sensor_delay", marks=pytest.mark.slow),
-    ],
+    ["28_pendulum_actuator_gain", "38_pendulum_sensor_delay"],
 )
 def test_nothing_is_missing_from_a_repaired_scene(tmp_path, name):
     # Drives and sensors, which rigid-body dynamics do not know of.
@@ -82,6 +80,7 @@ def test_nothing_is_missing_from_a_repaired_scene(tmp_path, name):
     assert again.gap.before == pytest.approx(result.gap.after, rel=0.1)
 
 
+@pytest.mark.slow
 def test_late_commands_and_late_sensors_are_told_as_one(tmp_path):
     truth, result = _run("34_cartpole_input_delay", tmp_path)
     (hidden,) = truth["effects"]

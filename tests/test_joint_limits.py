@@ -32,9 +32,11 @@ from makebreak.systems.arm.numerics.joint_limits import (
 )
 from makebreak.systems.arm.numerics.packed import packed
 from makebreak.systems.arm.numerics.serial_chain import chain_state
+from makebreak.systems.numerics.first_calls import deferred
 
 PLANT = make_control_plant()
-LAW = ImpedanceController(ImpedanceConfig(), PLANT)._law
+with deferred():  # Nothing is compiled while tests are collected.
+    LAW = ImpedanceController(ImpedanceConfig(), PLANT)._law
 CHAIN = serial_chain_of(PLANT, "tip")
 PACKED_CHAIN = packed(CHAIN)
 V = SPEED_SHARE * LAW.speed_max

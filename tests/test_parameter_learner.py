@@ -380,7 +380,7 @@ def test_scale_and_its_slopes():
     [
         pytest.param({"mass": 6.0}, marks=pytest.mark.slow),
         pytest.param({"mass": 1.5}, marks=pytest.mark.slow),
-        {"gap": 0.015},
+        pytest.param({"gap": 0.015}, marks=pytest.mark.slow),
         {"gap": -0.012, "mass": 4.5},
     ],
     ids=str,
@@ -407,7 +407,11 @@ def test_a_drawer_learns_the_dry_friction_of_its_rail(true):
     assert abs(gap) < 2e-3
 
 
-@pytest.mark.parametrize("task", [DOOR, DRAWER, LEG, BOX], ids=lambda t: t.name)
+@pytest.mark.parametrize(
+    "task",
+    [pytest.param(t, marks=[pytest.mark.slow] * (t in (DRAWER, BOX)), id=t.name)
+     for t in (DOOR, DRAWER, LEG, BOX)],
+)  # fmt: skip
 def test_with_the_right_model_nothing_is_invented(task):
     right = bench.run(task, task.values, knows=True, learns=False)
     learned = bench.run(task, task.values, knows=False, learns=True)
@@ -449,7 +453,9 @@ def noisy(task, true, std, seed=0):
     return learner._scale.values(memory.belief.mean), memory.belief
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    "seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 2))]
+)
 def test_noise_of_velocities_is_no_friction(seed):
     """5 mm/s: what sticks tells of friction only beyond the noise. (0.67 to 0.76 was
     learned for 0.4 before, with intervals that ended above it.)"""

@@ -251,7 +251,10 @@ def diagram_error(diagram):
 
 @pytest.mark.parametrize(
     "setting",
-    ["springs", pytest.param("springs_lab", marks=pytest.mark.slow), "engaging"],
+    [
+        "springs",
+        *(pytest.param(s, marks=pytest.mark.slow) for s in ("springs_lab", "engaging")),
+    ],  # fmt: skip
 )
 def test_the_plain_loops_are_the_diagrams(setting):
     """Tick for tick, with noise and delay: only the sum of the errors is taken in

@@ -115,9 +115,7 @@ COMES_BACK = {
 @pytest.mark.parametrize(
     "hidden",
     [
-        name
-        if name in ("saturation", "wave")
-        else pytest.param(name, marks=pytest.mark.slow)
+        name if name == "saturation" else pytest.param(name, marks=pytest.mark.slow)
         for name in COMES_BACK
     ],
 )

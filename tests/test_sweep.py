@@ -171,6 +171,7 @@ def start_sweep(out):
     return subprocess.Popen([sys.executable, "-c", main], env=trials.run_environment())
 
 
+@pytest.mark.slow
 def test_a_killed_sweep_goes_on_to_the_same_table(tmp_path):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     assert start_sweep(whole).wait(timeout=240) == 0
