@@ -232,6 +232,8 @@ def _expanded(path: Path, packages: Mapping[str, str]) -> str:
         return xacro.process_file(str(path)).toxml()
     except Exception as error:  # It raises many types, of Python's too.
         why = " ".join(str(error).split())
+        if "substitution argument" in why:  # One that has no default.
+            why += f"; expand it first: xacro {path.name} ARG:=VALUE ... > robot.urdf"
         raise ValueError(f"{path}: xacro says: {why}") from None
     finally:
         substitution_args._eval_find = before

@@ -12,6 +12,7 @@ from makebreak.gap.data.content import check_contents, likeness
 from makebreak.gap.data.reading import read_recording, read_recordings
 from makebreak.gap.data.reshaped import reshaped
 from makebreak.gap.data.robot import propose_scene, read_log, read_robot
+from makebreak.gap.data.servo_gains import needed_efforts
 from makebreak.gap.data.table import write_recording
 from makebreak.gap.data.turns import without_turns
 
@@ -282,6 +283,42 @@ def test_efforts_stamped_late_are_said_to_be(tmp_path, late, said):
     found = judged(tmp_path, shift)
     assert ("effort_late" in found) == said
     assert not said or "30 ms before" in found["effort_late"]
+
+
+@pytest.mark.parametrize("late, damping", [(0.03, 0.0), (0.0, 0.0), (0.0, 0.5)])
+def test_late_efforts_of_a_slow_robot_are_no_friction(tmp_path, late, damping):
+    """A sixth of the pace: what is late by 30 ms differs by 2 % at most, and goes with
+    the velocity. So does damping that the model has and the robot lacks."""
+    path, log = exact("three", tmp_path, np.random.default_rng(4))
+    at = [f"joint{k}_position" for k in (1, 2, 3)]
+    q, pace = np.stack([log.columns[name] for name in at], axis=1), 6.0
+    v = np.gradient(q, pace * log.time, axis=0)
+    vd = np.gradient(v, pace * log.time, axis=0)
+    efforts = needed_efforts(read_robot(path).plant, q, v, vd)
+    path.write_text(path.read_text().replace(
+        "</joint>", f'<dynamics damping="{damping}"/></joint>'
+    ))  # fmt: skip
+    t = np.arange(0.0, 60.0, 0.01)
+    columns = {"time": t}
+    for k, name in enumerate(at):
+        columns[name] = np.interp(t, pace * log.time, q[:, k])
+        own = np.interp(t - late, pace * log.time, efforts[:, k])
+        noise = 0.02 * np.std(own) * np.random.default_rng(k).normal(size=len(t))
+        columns[f"joint{k + 1}_effort"] = own + noise
+    log_path = csv(tmp_path / "slow.csv", columns)
+    said = propose_scene(read_robot(path), [read_log(log_path)]).said
+    assert [s.kind for s in said] == (["effort_late"] if late else [])
+
+
+def test_positions_of_a_gear_for_each_joint_are_asked_about(tmp_path):
+    def on_motors_side(columns):
+        for k, gear in enumerate((50.0, 101.0, 160.0), start=1):
+            columns[f"joint{k}_position"] = gear * columns[f"joint{k}_position"]
+            columns[f"joint{k}_velocity"] = gear * columns[f"joint{k}_velocity"]
+            columns[f"joint{k}_effort"] = columns[f"joint{k}_effort"] / gear
+
+    found = judged(tmp_path, on_motors_side)
+    assert "each of a gear of its own?" in found["units_unsure"]
 
 
 def test_efforts_in_parts_of_unknown_ratings_are_asked_about(tmp_path):

@@ -265,6 +265,17 @@ def test_resolution_and_a_stuck_channel_are_found(tmp_path):
     assert one(findings(tmp_path, columns), "stuck").size == pytest.approx(19 / RATE)
 
 
+def test_an_encoder_that_turns_slowly_is_not_stuck(tmp_path):
+    """Noise of a third of its steps, which a slow turn takes far apart."""
+    columns = arm(11)
+    t, step = np.arange(N) / RATE, 4e-4
+    noisy = np.sin(0.9 * t) + 0.3 * step * np.random.default_rng(2).normal(size=N)
+    columns["arm.j0.position"] = np.round(noisy / step) * step
+    columns["arm.j0.velocity"] = 0.9 * np.cos(0.9 * t)
+    found = findings(tmp_path, columns)
+    assert not [f for f in found if f.kind == "stuck"]
+
+
 def test_a_channel_that_swings_from_sample_to_sample_is_no_noise(tmp_path):
     columns = arm(12)
     columns["arm.j0.velocity"][N // 3 :: 2] += 20.0

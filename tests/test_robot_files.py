@@ -207,6 +207,9 @@ def test_xacro_is_expanded_with_its_includes(tmp_path):
     path.write_text(XACRO.replace("own_description", "nowhere"))
     with pytest.raises(ValueError, match="xacro says: .*package nowhere is unknown"):
         read_robot(path)
+    path.write_text(XACRO.replace("find own_description", "arg name"))
+    with pytest.raises(ValueError, match="expand it first: xacro arm.urdf.xacro ARG"):
+        read_robot(path)
 
 
 FRICTION = '<dynamics damping="0.3" friction="0.2"/>'

@@ -55,6 +55,20 @@ def test_a_scara_has_a_unit_for_what_turns_and_one_for_what_slides(units, veloci
         assert bool(found[name].told) == (own != 1.0)
 
 
+def test_wheels_that_go_on_and_on_are_in_rad_and_arms_that_come_back_in_degrees():
+    """Of joints without limits, by how far they turn."""
+    joints = [JointName(f"r.{k}", False) for k in "abc"]
+    matches = {"t": Match("t", "time")} | {
+        f"{k}_q": Match(f"{k}_q", f"r.{k}.position") for k in "abc"
+    }
+    swing, roll = np.sin(1.3 * T), 6.0 * T + 0.3 * np.sin(2.0 * T)
+    for qs, scale in (((roll, roll, swing), 1.0),
+                      ((60.0 * swing, 80.0 * swing, swing), DEG),
+                      ((60.0 * swing, swing, swing), 1.0)):  # fmt: skip
+        log = {"t": T} | dict(zip(("a_q", "b_q", "c_q"), qs, strict=True))
+        assert in_units(log, joints, matches)["a_q"].scale == pytest.approx(scale)
+
+
 def test_jumps_by_a_turn_and_of_a_slide_hide_no_unit():
     """A slide that was moved by 360 mm between two rows jumps by no turn."""
     log = columns(DEG, 1e-3, DEG, 1e-3)

@@ -305,7 +305,7 @@ def _longest_stuck(recording: Recording, channel: Channel) -> float:
         moving, n = moving + int(np.sum(~same)), n + len(same)
         if not same.any():
             continue
-        coarse = len(np.unique(y)) < 0.5 * len(y)
+        coarse = channel.step > channel.noise or len(np.unique(y)) < 0.5 * len(y)
         usual = np.quantile(np.abs(step), 0.995)
         starts = np.flatnonzero(np.diff(same.astype(int), prepend=0) == 1)
         ends = np.flatnonzero(np.diff(same.astype(int), append=0) == -1) + 1

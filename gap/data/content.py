@@ -20,7 +20,7 @@ from itertools import combinations, permutations
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
-from scipy.optimize import linear_sum_assignment, minimize_scalar
+from scipy.optimize import linear_sum_assignment, lsq_linear, minimize_scalar
 
 from makebreak.gap.data.findings import Finding
 from makebreak.gap.data.match import AS_SAID, JointName, Match
@@ -54,13 +54,14 @@ GAINS = (0.45, 1.6)
 # Shares of an effort that is the weight's, to tell by; of the weight that one without
 # it may still have.
 WEIGHS, LEFT_OUT = 0.1, 0.2
-FEW = 100  # Instants at which many readings are tried.
+FEW, MOST_LATE = 100, 300  # Instants at which many readings, or delays, are tried.
 # Joints of which all orders are tried, those of which swaps are, and those that may be
 # off where one has another zero.
 ALL_ORDERS, MOST_ORDERED, MOST_OFF = 6, 8, 8
 ROOM = 0.1  # Of a joint's range, beyond it.
 # Logarithms: of gears that are tried, and the step between two.
 LARGEST_GEAR, GEAR_STEP = 5.7, 0.1
+ONE_GEAR = 0.03  # Of what is needed: what efforts behind one gear for all leave.
 FAR = 1000.0  # [rad] No joint turns by so much between its limits.
 LATEST_SEC, LATE_STEP_SEC = 0.1, 0.01
 NO_WEIGHT = 0.02  # Of what an effort without weight leaves at most.
@@ -68,7 +69,7 @@ NO_WEIGHT = 0.02  # Of what an effort without weight leaves at most.
 # holds it up, smaller.
 LARGE, LARGER = 20.0, 3.0
 WITHOUT_WEIGHT = "effort_without_weight"
-UNSURE, LATE = "effort_unsure", "effort_late"
+UNSURE, UNITS_UNSURE, LATE = "effort_unsure", "units_unsure", "effort_late"
 FROM_A_START = "position_from_start"
 AT_ZERO = 1e-3  # [rad], [m]
 UNEXPLAINED = "effort_unexplained"
@@ -80,6 +81,7 @@ _SEVERITY = {
     "no_content": "warning",
     "too_short": "info",
     UNSURE: "warning",
+    UNITS_UNSURE: "warning",
     LATE: "warning",
     FROM_A_START: "warning",
     UNEXPLAINED: "warning",
@@ -295,6 +297,20 @@ class Contents:
         halves = [self.column(name, half) for half in (0, 1)]
         return likeness(self.needed[:, i], y, np.stack(rest, axis=1), halves)
 
+    def left_by_friction(self, name: str, i: int) -> float:
+        """Share of what a joint needs that a column, a bias and friction, which never
+        drives, leave."""
+        y, v = self.column(name), self.v[:, i]
+        if y is None or not np.ptp(y) > 0.0:
+            return 1.0
+        against = [-np.abs(v).max() * v, -np.sign(v)]
+        X = np.stack([y, np.ones_like(v), *against], axis=1)
+        X /= np.maximum(np.abs(X).max(axis=0), 1e-300)
+        needed = self.needed[:, i]
+        low = [-np.inf, -np.inf, 0.0, 0.0]
+        off = lsq_linear(X, needed, (low, np.inf)).fun
+        return float(off @ off / max(np.var(needed) * len(v), 1e-300))
+
     def lacks_weight(self, name: str, i: int) -> bool | None:
         """Whether an effort has what the motion needs and not what the weight does;
         None where the two look alike, or it does not go with them."""
@@ -441,13 +457,23 @@ def _in_other_units(contents: Contents, matches, said) -> list[Match]:
     gear = _round(np.exp(-best) / scale, 0.005 * np.exp(-best) / scale)
     factor = (1.0 / gear if unit is None else unit.factor) / scale
     contents.scaled(group, factor)
-    after, clearer = _misfit(contents, efforts, True), 2.0 if unit else CLEARER
+    after = _misfit(contents, efforts, True)
+    # Of gears that differ, one in between tells half of it.
+    clearer, most = (2.0, 1.0 - EXPLAINS) if unit else (CLEARER, ONE_GEAR)
     if (
         not contents.is_inside()
         or abs(np.log(factor)) < ALIKE
-        or after > min(np.log(1.0 - EXPLAINS), before - np.log(clearer))
+        or after > min(np.log(most), before - np.log(clearer))
     ):
         contents.scaled(group, 1.0 / factor)
+        if (sized or far) and before > np.log(1.0 - EXPLAINS):
+            which = ", ".join(mine[i] for i in group)
+            says = (
+                f"{which} are too large for rad, and by the efforts in no unit that is "
+                "known, nor on the motor's side of one gear: each of a gear of its "
+                "own? Then give each its scale in the sidecar."
+            )
+            said.append(Said(UNITS_UNSURE, contents.joints[group[0]].name, 0.0, says))
         return matches
     names = {contents.joints[i].name for i in group}
     speeds = _columns_of(contents, matches, ("velocity",))
@@ -839,23 +865,23 @@ def _from_a_start(contents: Contents, matches, said) -> None:
 
 def _late(contents: Contents, matches, said) -> None:
     """Says where efforts are measured, or stamped, after they have acted. (Before it,
-    they may be commands that come through late, which a search names.)"""
+    they may be commands that come through late, which a search names.) Of a slow robot
+    that looks like friction that drives: friction has its sign here."""
     efforts = _columns_of(contents, matches, _DRIVES)
-    before = _misfit(contents, efforts, True) if efforts else -np.inf
-    if before < np.log(TOLD_WELL):
-        return
-    few = contents.fewer(FEW)
+    few = contents.fewer(MOST_LATE)
 
     def left(late: float) -> float:
         few.late = late
-        return _misfit(few, efforts, True)
+        each = [few.left_by_friction(name, i) for i, name in efforts.items()]
+        return float(np.mean(np.log(np.maximum(each, LEAST_LEFT)))) if each else 0.0
 
+    before = left(0.0)
+    if before < np.log(10.0 * LEAST_LEFT):
+        return
     start = min(np.arange(-LATEST_SEC, LATEST_SEC, LATE_STEP_SEC), key=left)
     near = (start - LATE_STEP_SEC, start + LATE_STEP_SEC)
     late = float(minimize_scalar(left, bounds=near, method="bounded").x)
-    contents.late = late
-    after, contents.late = _misfit(contents, efforts, True), 0.0
-    if late > contents.period and after < before - np.log(CLEARER):
+    if late > contents.period and left(late) < before - np.log(CLEARER):
         says = (
             f"{', '.join(efforts.values())} go with the motion {1e3 * late:.2g} ms "
             "before their stamps: they are filtered or stamped late, or have another "

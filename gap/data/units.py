@@ -29,7 +29,9 @@ _NEAR = 0.03
 _RATE, _JUMP, _BEYOND, _NAME, _OFFSET, _TIME = 5.0, 3.0, 4.0, 3.0, 1.0, 4.0
 _UNLIKE = 0.1  # Of a velocity that is not in its position's unit per second.
 _OF_ITS_OWN = 2.0  # A joint pays so much less by another reading than the others'.
-_LARGE = 20.0  # [rad] Of a joint without limits.
+# [rad] Of a joint without limits; the part of its range by which one that comes back is
+# off at the end at most; what that one pays, alone too little for another reading.
+_LARGE, _BACK, _UNLIMITED = 20.0, 0.8, 2.5
 _ROOM = 0.1  # Of a joint's range, beyond it.
 
 
@@ -242,8 +244,11 @@ class _Columns:
         low, high = float(np.nanmin(q)), float(np.nanmax(q))
         j = self.joint
         if not np.isfinite(j.upper - j.lower):
+            # A wheel goes on and on, in rad; an arm comes back.
             large = max(abs(low), abs(high)) > _LARGE and not j.prismatic
-            return 0.0, _BEYOND - 1.0 if large else 0.0
+            there = q[np.isfinite(q)]
+            back = abs(there[-1] - there[0]) < _BACK * (high - low)
+            return 0.0, _UNLIMITED if large and back else 0.0
         room = _ROOM * (j.upper - j.lower)
         middle = 0.5 * (j.lower + j.upper)
 
