@@ -310,6 +310,46 @@ def test_late_efforts_of_a_slow_robot_are_no_friction(tmp_path, late, damping):
     assert [s.kind for s in said] == (["effort_late"] if late else [])
 
 
+def test_left_and_right_legs_taken_for_each_other_are_asked_about(tmp_path):
+    """Two legs whose hips lean to their own sides, and a log of them: right, and with
+    all columns of the one called the other's."""
+    legs = []
+    for side, y in (("left", 0.1), ("right", -0.1)):
+        for k, (axis, com) in enumerate((("1 0 0", f"0.02 {y} 0"),
+                                         ("0 1 0", "0.1 0 -0.2"))):  # fmt: skip
+            parent = "base" if k == 0 else f"{side}0"
+            legs.append(
+                f'<link name="{side}{k}"><inertial><origin xyz="{com}"/>'
+                '<mass value="1"/><inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" '
+                f'ixz="0" iyz="0"/></inertial></link><joint name="{side}_{k}" '
+                f'type="revolute"><parent link="{parent}"/><child link="{side}{k}"/>'
+                f'<origin xyz="0 {y} 0"/><axis xyz="{axis}"/><limit lower="-2" '
+                'upper="2" effort="50" velocity="20"/></joint>'
+            )
+    path = tmp_path / "legs.urdf"
+    path.write_text(f'<robot name="legs"><link name="base"/>{"".join(legs)}</robot>')
+    robot = read_robot(path)
+    t = np.arange(0.0, 12.0, 0.01)
+    w = np.array([1.3, 2.1, 1.7, 2.9])
+    q = 0.6 * np.sin(t[:, None] * w)
+    tau = needed_efforts(robot.plant, q, w * 0.6 * np.cos(t[:, None] * w), -q * w**2)
+    for swapped in (False, True):
+        columns = {"time": t}
+        for k, joint in enumerate(robot.joints):
+            name = joint.name.partition(".")[2]
+            if swapped:
+                side, end = name.split("_")
+                name = f"{'left' if side == 'right' else 'right'}_{end}"
+            columns |= {f"{name}_position": q[:, k], f"{name}_effort": tau[:, k]}
+        log = read_log(csv(tmp_path / "log.csv", columns))
+        said = {s.kind: s.says for s in propose_scene(robot, [log]).said}
+        assert ("joints_mirrored" in said) == swapped
+        if swapped:
+            assert "legs.right_0, legs.left_0 turned" in said["joints_mirrored"]
+        else:
+            assert said == {}
+
+
 def test_positions_of_a_gear_for_each_joint_are_asked_about(tmp_path):
     def on_motors_side(columns):
         for k, gear in enumerate((50.0, 101.0, 160.0), start=1):

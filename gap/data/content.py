@@ -72,7 +72,7 @@ WITHOUT_WEIGHT = "effort_without_weight"
 UNSURE, UNITS_UNSURE, LATE = "effort_unsure", "units_unsure", "effort_late"
 FROM_A_START = "position_from_start"
 AT_ZERO = 1e-3  # [rad], [m]
-UNEXPLAINED = "effort_unexplained"
+UNEXPLAINED, MIRRORED = "effort_unexplained", "joints_mirrored"
 _UNSURE = (
     "larger than the model needs, several times, and no rotor would do: another unit, "
     "or a load or a spring that the model lacks; taken as it is"
@@ -85,6 +85,7 @@ _SEVERITY = {
     LATE: "warning",
     FROM_A_START: "warning",
     UNEXPLAINED: "warning",
+    MIRRORED: "warning",
 }  # Else: an error.
 _DRIVES = ("effort_command", "effort_measured")
 _UNITS = (
@@ -365,6 +366,7 @@ def by_content(
     matches = _rightly_ordered(contents, matches, said)
     matches = _all_ordered(contents, matches, said)
     matches = _from_their_zeros(contents, matches, said)
+    _mirrored(contents, matches, said)
     matches = _drives_that_drive(contents, matches, said)
     matches = _in_other_units(contents, matches, said)
     matches = _with_factors(contents, matches, said)
@@ -750,6 +752,31 @@ def _from_their_zeros(contents: Contents, matches, said) -> list[Match]:
         and m.why != AS_SAID else m
         for m in matches
     ]  # fmt: skip
+
+
+def _mirrored(contents: Contents, matches, said) -> None:
+    """Says where joints that turn the other way would explain the efforts: all of such
+    a joint may be reversed, or left and right limbs are taken for each other."""
+    efforts = _columns_of(contents, matches, _DRIVES)
+    before = _misfit(contents, efforts) if efforts else -np.inf
+    if before < np.log(TOLD_WELL):
+        return
+    few, gains = contents.fewer(FEW), {}
+    start = _misfit(few, efforts)
+    for i in (i for i in efforts if not contents.joints[i].prismatic):
+        few.scaled([i], -1.0)
+        gains[i] = start - _misfit(few, efforts)
+        few.scaled([i], -1.0)
+    others = [i for i, gain in gains.items() if gain > np.log(CLEARER) / len(efforts)]
+    few.scaled(others, -1.0)
+    if _misfit(few, efforts) < min(np.log(1.0 - EXPLAINS), start - np.log(CLEARER)):
+        names = ", ".join(contents.joints[i].name for i in others)
+        says = (
+            f"The efforts would go with the motion if {names} turned the other way: "
+            "are left and right limbs taken for each other (columns in another order), "
+            "or are these joints reversed? Put it right in the sidecar."
+        )
+        said.append(Said(MIRRORED, contents.joints[others[0]].name, 0.0, says))
 
 
 # ----- What drives a joint
