@@ -47,7 +47,7 @@ from makebreak.diagrams.station import (
     from_wrist,
     make_control_plant,
 )
-from makebreak.diagrams.wiring import refuse_changed, timed
+from makebreak.diagrams.wiring import refuse_changed, split, timed
 from makebreak.models.friction_zones import FrictionZone
 from makebreak.models.scene import Scene
 from makebreak.systems.arm.impedance_controller import HybridConfig, serial_chain_of
@@ -89,6 +89,7 @@ from makebreak.systems.changing_contact.numerics.push_motion import (
     DOWN,
     TABLE_SEGMENT,
 )
+from makebreak.systems.changing_contact.numerics.reference_blend import COMMAND
 from makebreak.systems.changing_contact.push_motion import PushMotion, PushMotionConfig
 from makebreak.systems.changing_contact.reference_blend import (
     ReferenceBlend,
@@ -550,11 +551,12 @@ def _add_touch(builder, config: GentleRollingConfig, ball: BallRollingConfig) ->
     connect("reference_blend", "contact_directions",
             ("wrench_tare", "force_directions"), ("mode_detector", "force_directions"),
             ("forward_model_bank", "force_directions"))  # fmt: skip
-    connect("reference_blend", "x_desired", impedance)
-    connect("reference_blend", "wrench", (impedance, "wrench_feedforward"))
-    connect("reference_blend", "damping", impedance)
-    connect("reference_blend", "force_directions", impedance)
-    connect("reference_blend", "force_targets", impedance)
+    whole = builder.GetSubsystemByName("reference_blend").GetOutputPort("command")
+    names = ("x_desired", "wrench_feedforward", "damping", "force_directions",
+             "force_targets")  # fmt: skip
+    parts = split(builder, whole, "arm_command", dict(zip(names, COMMAND, strict=True)))
+    for name, port in parts.items():
+        builder.Connect(port, builder.GetSubsystemByName(impedance).GetInputPort(name))
 
     # For scoring and for the eye alone.
     bundle = add("telemetry", Multiplexer([size for _, _, size in SIGNALS.values()]))

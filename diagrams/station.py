@@ -9,7 +9,7 @@ from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
-from pydrake.systems.primitives import Demultiplexer, Saturation
+from pydrake.systems.primitives import Saturation
 
 from makebreak.diagrams.camera import CameraConfig, add_camera
 from makebreak.diagrams.fault_kinds import Injected
@@ -22,7 +22,7 @@ from makebreak.diagrams.faults import (
 )
 from makebreak.diagrams.realism import StationErrors, with_errors
 from makebreak.diagrams.scene_facts import actuators_of
-from makebreak.diagrams.wiring import add_generalized_forces
+from makebreak.diagrams.wiring import add_generalized_forces, split
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 from makebreak.models.model_files import MODELS
@@ -263,10 +263,9 @@ def _add_encoders(sensing: _Sensing) -> None:
     std = np.repeat([noise.position, noise.velocity], n)
     encoders = sensing.noisy(f"{ARM}_encoders", encoders, std, sensing.seeds[0])
     encoders = sensing.faulty(encoders, "position_velocity")
-    split = builder.AddNamedSystem(f"{ARM}_encoders_split", Demultiplexer([n, n]))
-    builder.Connect(encoders, split.get_input_port())
-    for i, name in enumerate(("position", "velocity")):
-        builder.ExportOutput(split.get_output_port(i), f"{ARM}.{name}_measured")
+    parts = split(builder, encoders, f"{ARM}_encoders", dict(position=n, velocity=n))
+    for name, port in parts.items():
+        builder.ExportOutput(port, f"{ARM}.{name}_measured")
 
 
 def _add_torque_sensor(
@@ -384,14 +383,10 @@ def _add_monitor(builder: DiagramBuilder, plant: MultibodyPlant, effort_max) -> 
         upper=np.array([joint.position_upper_limits()[0] for joint in joints]),
     )
     monitor = builder.AddNamedSystem("monitor", SafetyMonitor(limits, 0.001, 9e-4))
+    state = plant.get_state_output_port(plant.GetModelInstanceByName(ARM))
     n = len(joints)
-    truth = builder.AddNamedSystem("monitor_split", Demultiplexer([n, n]))
-    builder.Connect(
-        plant.get_state_output_port(plant.GetModelInstanceByName(ARM)),
-        truth.get_input_port(),
-    )
-    for i, name in enumerate("qv"):
-        builder.Connect(truth.get_output_port(i), monitor.GetInputPort(name))
+    for name, port in split(builder, state, "monitor", dict(q=n, v=n)).items():
+        builder.Connect(port, monitor.GetInputPort(name))
     builder.ConnectInput(f"{ARM}.torque_commanded", monitor.GetInputPort("tau"))
     builder.ExportOutput(monitor.GetOutputPort("worst"), MONITOR)
 

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 from pydrake.geometry import Meshcat
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder, LeafSystem, OutputPort, System
-from pydrake.systems.primitives import Adder, Demultiplexer
+from pydrake.systems.primitives import Adder, Selector, SelectorParams
 
 from makebreak.systems.views.legend import Legend, LegendConfig
 
@@ -64,11 +64,36 @@ def connect_command(
 ) -> None:
     """Connects an ArmReference to an ImpedanceController. Pose and wrench share a port,
     as evaluating a Python system's port takes longer than computing its value."""
-    sizes = [reference.GetOutputPort(name).size() for name in ("x_desired", "wrench")]
-    split = builder.AddNamedSystem("arm_command_split", Demultiplexer(sizes))
-    builder.Connect(reference.GetOutputPort("command"), split.get_input_port())
-    for i, name in enumerate(("x_desired", "wrench_feedforward")):
-        builder.Connect(split.get_output_port(i), arm.GetInputPort(name))
+    sizes = {into: reference.GetOutputPort(name).size() for name, into in (
+        ("x_desired", "x_desired"), ("wrench", "wrench_feedforward"))}  # fmt: skip
+    parts = split(builder, reference.GetOutputPort("command"), "arm_command", sizes)
+    for name, port in parts.items():
+        builder.Connect(port, arm.GetInputPort(name))
+
+
+def split(
+    builder: DiagramBuilder, port: OutputPort, name: str, sizes: Mapping[str, int]
+) -> dict[str, OutputPort]:
+    """The parts of a port, one after the other, by name.
+
+    Drake's Demultiplexer would count as changed whenever time goes on, and all that
+    reads its parts be computed anew.
+
+    Args: name: of the system that is added, before "_split"; sizes: {part: size}.
+    """
+    at, outputs = 0, []
+    for part, size in sizes.items():
+        entries = [
+            SelectorParams.OutputSelection(input_port_index=0, input_offset=at + i)
+            for i in range(size)
+        ]
+        outputs.append(SelectorParams.OutputPortParams(name=part, selections=entries))
+        at += size
+    whole = SelectorParams.InputPortParams(name="whole", size=port.size())
+    params = SelectorParams(inputs=[whole], outputs=outputs)
+    parts = builder.AddNamedSystem(f"{name}_split", Selector(params))
+    builder.Connect(port, parts.get_input_port(0))
+    return {part: parts.GetOutputPort(part) for part in sizes}
 
 
 def add_legend(

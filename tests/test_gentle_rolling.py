@@ -59,11 +59,12 @@ from makebreak.systems.changing_contact.numerics.push_motion import (
 )
 from makebreak.systems.changing_contact.numerics.reference_blend import (
     blended_reference,
+    command,
     weight,
 )
 from makebreak.systems.changing_contact.push_motion import PushMotion, PushMotionConfig
 from makebreak.systems.contact_mpc import c3_mpc, lcs_builder, residual_learner
-from makebreak.systems.contact_mpc.numerics.ball_state import pack
+from makebreak.systems.contact_mpc.numerics.ball_state import P_TIP, V_TIP, pack
 from makebreak.systems.contact_mpc.numerics.rolling_task import (
     REPOSITION,
     ROLL,
@@ -724,3 +725,37 @@ def test_a_landing_is_softer_with_the_second_papers_systems(tmp_path):
         assert result["initiated"]
         peaks[gentle] = result["contact_force_peak_N"]
     assert peaks["true"] < 0.8 * peaks["false"]
+
+
+def test_the_arms_command_is_the_planners_or_the_shapers():
+    """Where the shaper presses down, the arm is where it is along the vertical."""
+    rng = np.random.default_rng(4)
+    planned, shaped, x = rng.normal(size=(3, 19))
+    frame, planned_wrench, fed = (rng.normal(size=n) for n in (7, 6, 6))
+    rows, targets = np.array([0.0, 0, -1, 0, 0, 0]), np.array([2.0, 0.0])
+
+    def commanded(leads):
+        blend = np.array([leads, leads, 0.0])
+        return np.split(
+            command(
+                1.0, blend, blend, 0.1, np.array([400.0, 120.0]), planned, frame,
+                shaped, rows, x, planned_wrench, fed, targets,
+            ),
+            np.cumsum([19, 6, 6, 6]),
+        )  # fmt: skip
+
+    pose, wrench, damping, directions, forces = commanded(0.0)
+    np.testing.assert_array_equal(pose, planned)
+    np.testing.assert_array_equal(wrench, planned_wrench)
+    assert (damping == 400.0).all() and not directions.any() and not forces.any()
+    pose, wrench, damping, directions, forces = commanded(1.0)
+    origin = frame[:3] + (1.0 - frame[6]) * frame[3:6]
+    np.testing.assert_allclose(pose[:2], (shaped[:3] + origin)[:2])
+    np.testing.assert_allclose(pose[7:9], (shaped[7:10] + frame[3:6])[:2])
+    np.testing.assert_allclose(pose[[2, 9, 15]], [x[P_TIP][2], x[V_TIP][2], 0.0],
+                               atol=1e-12)  # fmt: skip
+    np.testing.assert_array_equal(pose[3:7], shaped[3:7])
+    np.testing.assert_array_equal(wrench, fed)
+    assert (damping == 120.0).all()
+    np.testing.assert_array_equal(directions, rows)
+    np.testing.assert_array_equal(forces, targets)

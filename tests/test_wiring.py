@@ -7,10 +7,10 @@ import pytest
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import SpatialInertia, UnitInertia
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource
 
-from makebreak.diagrams.wiring import add_generalized_forces, check_own, timed
+from makebreak.diagrams.wiring import add_generalized_forces, check_own, split, timed
 
 
 @dataclass
@@ -63,3 +63,37 @@ def test_forces_are_added_to_those_that_a_plant_has():
     simulator.AdvanceTo(0.1)
     v = plant.GetVelocities(plant.GetMyContextFromRoot(simulator.get_context()))
     np.testing.assert_allclose(v[3:], 0.1 / 2.0 * forces[:, 3:].sum(axis=0), rtol=1e-9)
+
+
+def test_parts_of_a_port_are_read_in_order_and_not_anew_when_time_goes_on():
+    """Of Drake's Demultiplexer all that reads its parts is computed at each instant."""
+    builder, computed = DiagramBuilder(), []
+    whole = builder.AddSystem(LeafSystem())
+    whole.DeclareStateOutputPort(
+        "all", whole.DeclareDiscreteState(np.array([1.0, np.nan, 3.0]))
+    )
+    parts = split(builder, whole.get_output_port(), "both", {"one": 1, "two": 2})
+
+    class Reader(LeafSystem):
+        def __init__(self):
+            super().__init__()
+            self.two = self.DeclareVectorInputPort("two", 2)
+            ticket = {self.two.ticket()}
+            self.DeclareVectorOutputPort("y", 2, self.calc, ticket)
+
+        def calc(self, context, output):
+            computed.append(context.get_time())
+            output.SetFromVector(self.two.Eval(context))
+
+    reader = builder.AddSystem(Reader())
+    builder.Connect(parts["two"], reader.two)
+    builder.ExportOutput(reader.get_output_port(), "two")
+    builder.ExportOutput(parts["one"], "one")
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    for time in (0.0, 0.5, 1.0):
+        context.SetTime(time)
+        two = diagram.GetOutputPort("two").Eval(context)
+    np.testing.assert_array_equal(two, [np.nan, 3.0])
+    assert diagram.GetOutputPort("one").Eval(context) == [1.0]
+    assert computed == [0.0]

@@ -93,43 +93,44 @@ class WrenchTare(LeafSystem):
         self._memory = self.DeclareDiscreteState(new_memory())
         ticket = {self.discrete_state_ticket(self._memory)}
 
-        def memory(context):
-            return context.get_discrete_state(self._memory).value()
-
         for name, size, value, inputs in (
             ("wrench", 6, self._tared, {self._wrench.ticket()}),
             ("wrench_mean", 6, self._tared_mean, {self._wrench.ticket()}),
             ("force_directions", 6, self._sloped, {self._rows.ticket()}),
-            ("bias", 6, lambda c: bias_of(memory(c)), set()),
-            ("slope", 3, lambda c: memory(c)[SLOPE], set()),
-            ("status", 1, lambda c: memory(c)[STATUS], set()),
         ):
-            self.DeclareVectorOutputPort(name, size, _calc(value), ticket | inputs)
+            self.DeclareVectorOutputPort(name, size, value, ticket | inputs)
+        self._told = [
+            (self.DeclareDiscreteState(said(new_memory())), said)
+            for said in (
+                bias_of,
+                lambda memory: memory[SLOPE],
+                lambda memory: memory[STATUS],
+            )
+        ]
+        for name, (state, _) in zip(
+            ("bias", "slope", "status"), self._told, strict=True
+        ):
+            self.DeclareStateOutputPort(name, state)
         self.DeclarePeriodicDiscreteUpdateEvent(
             config.period_sec, config.offset_sec, self._update
         )
 
-    def _tared(self, context: Context) -> np.ndarray:
+    def _tared(self, context: Context, output: BasicVector):
         memory = context.get_discrete_state(self._memory).value()
-        return tared(self._law, memory, self._wrench.Eval(context))
+        output.SetFromVector(tared(self._law, memory, self._wrench.Eval(context)))
 
-    def _tared_mean(self, context: Context) -> np.ndarray:
+    def _tared_mean(self, context: Context, output: BasicVector):
         memory = context.get_discrete_state(self._memory).value()
-        return tared_mean(self._law, memory, self._wrench.Eval(context))
+        output.SetFromVector(tared_mean(self._law, memory, self._wrench.Eval(context)))
 
-    def _sloped(self, context: Context) -> np.ndarray:
+    def _sloped(self, context: Context, output: BasicVector):
         memory = context.get_discrete_state(self._memory).value()
-        return sloped(memory, self._rows.Eval(context))
+        output.SetFromVector(sloped(memory, self._rows.Eval(context)))
 
     @timed
     def _update(self, context: Context, discrete_state):
         memory = context.get_discrete_state(self._memory).value()
         memory = tick(self._law, memory, *[p.Eval(context) for p in self._ports])
         discrete_state.set_value(self._memory, memory)
-
-
-def _calc(value):
-    def calc(context: Context, output: BasicVector):
-        output.SetFromVector(value(context))
-
-    return calc
+        for state, said in self._told:
+            discrete_state.set_value(state, said(memory))

@@ -13,19 +13,25 @@ from makebreak.systems.changing_contact.numerics.contact_task import (
     REGION,
     SETTLE,
 )
-from makebreak.systems.changing_contact.numerics.push_motion import N_FRAME, frame_at
+from makebreak.systems.changing_contact.numerics.push_motion import N_FRAME
 from makebreak.systems.changing_contact.numerics.reference_blend import (
+    COMMAND,
     N_BLEND,
-    blended_reference,
+    command,
+    in_world,
+    mixed,
     warm_up,
     weight,
 )
-from makebreak.systems.contact_mpc.numerics.ball_state import N_X, P_BALL, P_TIP, V_TIP
+from makebreak.systems.contact_mpc.numerics.ball_state import N_X, P_BALL, P_TIP
 from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.settings import check_settings
 from makebreak.systems.numerics.timing import timed
 
 SPEED_MIN = 1e-3  # [m/s] A slower reference has no direction.
+# Inputs, as numerics/reference_blend.py takes them.
+POSE = "planned", "frame", "shaped", "force_directions", "x"
+FORCES = "planned_wrench", "wrench_feedforward", "force_targets"
 
 
 @dataclass
@@ -50,8 +56,10 @@ class ReferenceBlend(LeafSystem):
              shaped (19,), force_directions (6,), force_targets (2,) of the shaper;
              wrench_feedforward (6,) of VariableImpedance; task_reference (9,) of
              RollingTask.
-    Outputs: x_desired (19,), wrench (6,), damping (6,), force_directions (6,),
-             force_targets (2,) for the impedance controller;
+    Outputs: x_desired (19,);
+             command (39,) for the impedance controller: x_desired, wrench (6,), damping
+             (6,), force_directions (6,), force_targets (2,), one after the other, as
+             evaluating ports takes longer than computing their values;
              direction (3,) of the reference in the world, zero at rest, and
              contact_directions (6,): the shaper's force directions, or where the
              planner leads from the tip to the ball, for who tells modes apart;
@@ -84,41 +92,18 @@ class ReferenceBlend(LeafSystem):
         }
         self._blend = self.DeclareDiscreteState(N_BLEND)
         self._soft = self.DeclareDiscreteState(N_BLEND)
-        mine = {self.discrete_state_ticket(self._blend)}
-        soft = {self.discrete_state_ticket(self._soft), self.time_ticket()}
-        now = mine | {self.time_ticket()}
+        now = {self.discrete_state_ticket(self._blend), self.time_ticket()}
+        soft = {self.discrete_state_ticket(self._soft)}
+        self._dampings = np.array([config.damping, config.damping_impact], dtype=float)
         for name, size, calc, reads in (
-            (
-                "x_desired",
-                19,
-                self._pose,
-                ("frame", "x", "planned", "shaped", "force_directions"),
-            ),
-            ("wrench", 6, self._wrench, ("planned_wrench", "wrench_feedforward")),
-            ("damping", 6, self._damping, ()),
-            (
-                "force_directions",
-                6,
-                self._directions,
-                ("force_directions",),
-            ),
-            ("force_targets", 2, self._targets, ("force_targets",)),
-            (
-                "direction",
-                3,
-                self._direction,
-                ("frame", "x", "planned", "shaped", "force_directions"),
-            ),
+            ("x_desired", 19, self._pose, POSE),
+            ("command", sum(COMMAND), self._command, (*POSE, *FORCES)),
+            ("direction", 3, self._direction, POSE),
             ("contact_directions", 6, self._contacts, ("x", "force_directions")),
-            (
-                "reference",
-                9,
-                self._reference,
-                ("frame", "x", "shaped", "force_directions", "task_reference"),
-            ),
+            ("reference", 9, self._reference, (*POSE[1:], "task_reference")),
         ):
             tickets = now | {self._in[port].ticket() for port in reads}
-            tickets = soft if name == "damping" else tickets
+            tickets |= soft if name == "command" else set()
             self.DeclareVectorOutputPort(name, size, calc, tickets)
         self.DeclarePeriodicDiscreteUpdateEvent(
             config.period_sec, config.offset_sec, self._update
@@ -140,66 +125,43 @@ class ReferenceBlend(LeafSystem):
     def _eval(self, name, context):
         return self._in[name].Eval(context)
 
-    def _weight(self, context, state=None):
-        state = self._blend if state is None else state
+    def _weight(self, context, state):
         blend = context.get_discrete_state(state).value()
         return weight(blend, context.get_time(), self._config.blend_sec)
 
     def _shaper_leads(self, context) -> bool:
         return context.get_discrete_state(self._blend).value()[1] > 0.5
 
-    def _shaped(self, context):
-        """The shaper's reference in the world."""
-        frame = self._eval("frame", context)
-        shaped = np.array(self._eval("shaped", context))
-        shaped[:3] += frame_at(frame, context.get_time())
-        shaped[7:10] += frame[3:6]
-        rows = self._eval("force_directions", context)
-        x = self._eval("x", context)
-        for n in (rows[:3], rows[3:]):
-            if n @ n > 0.5:
-                # There force decides: the arm is where it is, and goes on from there.
-                shaped[:3] += (n @ (x[P_TIP] - shaped[:3])) * n
-                shaped[7:10] += (n @ (x[V_TIP] - shaped[7:10])) * n
-                shaped[13:16] -= (n @ shaped[13:16]) * n
-        return shaped
-
     def _mixed(self, context):
-        w = self._weight(context)
-        planned = self._eval("planned", context)
-        if w[0] == 0.0 and w[1] == 0.0:
-            return planned
-        return blended_reference(planned, self._shaped(context), *w)
+        return mixed(
+            context.get_time(),
+            context.get_discrete_state(self._blend).value(),
+            self._config.blend_sec,
+            *self._evaluated(POSE, context),
+        )
+
+    def _evaluated(self, names, context):
+        return [self._in[name].Eval(context) for name in names]
 
     def _pose(self, context, output: BasicVector):
         output.SetFromVector(self._mixed(context))
+
+    def _command(self, context, output: BasicVector):
+        output.SetFromVector(
+            command(
+                context.get_time(),
+                context.get_discrete_state(self._blend).value(),
+                context.get_discrete_state(self._soft).value(),
+                self._config.blend_sec,
+                self._dampings,
+                *self._evaluated((*POSE, *FORCES), context),
+            )
+        )
 
     def _direction(self, context, output):
         v = self._mixed(context)[7:10]
         speed = np.sqrt(v @ v)
         output.SetFromVector(v / speed if speed > SPEED_MIN else np.zeros(3))
-
-    def _wrench(self, context, output):
-        w, _, _ = self._weight(context)
-        planned = self._eval("planned_wrench", context)
-        fed = self._eval("wrench_feedforward", context)
-        output.SetFromVector((1.0 - w) * planned + w * fed)
-
-    def _damping(self, context, output):
-        w, _, _ = self._weight(context, self._soft)
-        c = self._config
-        damping = c.damping + w * (c.damping_impact - c.damping)
-        output.SetFromVector(np.full(6, damping))
-
-    def _directions(self, context, output):
-        leads = self._shaper_leads(context)
-        rows = self._eval("force_directions", context) if leads else np.zeros(6)
-        output.SetFromVector(rows)
-
-    def _targets(self, context, output):
-        leads = self._shaper_leads(context)
-        targets = self._eval("force_targets", context) if leads else np.zeros(2)
-        output.SetFromVector(targets)
 
     def _contacts(self, context, output):
         if self._shaper_leads(context):
@@ -213,7 +175,7 @@ class ReferenceBlend(LeafSystem):
 
     def _reference(self, context, output):
         if self._shaper_leads(context):
-            X = self._shaped(context)
+            X = in_world(context.get_time(), *self._evaluated(POSE[1:], context))
             output.SetFromVector(np.concatenate([X[:3], X[7:10], X[13:16]]))
         else:
             output.SetFromVector(self._eval("task_reference", context))

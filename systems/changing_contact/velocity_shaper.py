@@ -209,6 +209,7 @@ class VelocityShaper(LeafSystem):
                     )
                     patterns = _Patterns(now, given, patterns.now, t, T)
                 discrete.set_value(int(self._memory), memory)
+                memory.setflags(write=False)  # As a state's, for compiled code.
                 state.get_mutable_abstract_state(int(self._patterns)).set_value(
                     patterns
                 )

@@ -19,6 +19,10 @@ from makebreak.systems.contact_mpc.numerics.contact_sampling import (
     sample_round,
 )
 from makebreak.systems.contact_mpc.numerics.lcs import is_finite
+from makebreak.systems.contact_mpc.numerics.outline import (
+    distance_to_outline,
+    outline_of,
+)
 from makebreak.systems.contact_mpc.numerics.plan_scores import score_plans
 from makebreak.systems.contact_mpc.numerics.push_task import CONTACT, errors
 from makebreak.systems.numerics.settings import check_settings
@@ -136,6 +140,9 @@ class ContactSampler(LeafSystem):
         x = model.x_default[None]
         lcs = model.build_many(x, np.zeros(p.n_u))
         score_plans(lcs, x, np.tile(x, (n_knots, 1)), p)
+        distance_to_outline(
+            np.zeros((1, 2)), outline_of(shape.parts, np.eye(3), np.zeros(3))
+        )
 
     @timed
     def _update(self, context, state):

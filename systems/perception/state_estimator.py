@@ -142,7 +142,9 @@ class StateEstimator(LeafSystem):
         observer.setflags(write=False)
         mobility = tip_mobility(self._chain, q_default)
         observe_force(observer, at, at, mobility, self._gain, self._dt)
-        input_with_force(at, at, at, mobility, self._tip_mass, self._dt)
+        before = at.view()
+        before.setflags(write=False)  # Of the state of a Context.
+        input_with_force(at, before, at, mobility, self._tip_mass, self._dt)
 
     def _mean_force(self, context, output):
         window = context.get_discrete_state(self._window).value()

@@ -18,6 +18,7 @@ def outline_of(parts, R, p):
     Returns: a list of convex polygons (m, 2) [m], counter-clockwise.
     Raises: ValueError for a part without area.
     """
+    parts = [np.ascontiguousarray(points) for points in parts]  # One compiled code.
     outline = [_hull_from_above(points, R, p) for points in parts]
     if any(len(polygon) < 3 for polygon in outline):
         raise ValueError("a part of the object has no area from above")
