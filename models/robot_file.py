@@ -374,20 +374,22 @@ def _cleaned_transmissions(document: minidom.Document) -> list[str]:
 
 
 def _without_empty_limits(document: minidom.Document) -> list[str]:
-    """Of joints whose lower limit is above the upper: simulators take that for none."""
+    """Of joints whose lower limit is above the upper, which simulators take for none,
+    and of continuous ones, which have none."""
     notes = []
     for limit in document.getElementsByTagName("limit"):
         try:
             low, high = (float(limit.getAttribute(k)) for k in ("lower", "upper"))
         except ValueError:
             continue
-        if low > high:
-            joint: Any = limit.parentNode
+        joint: Any = limit.parentNode
+        if low > high or joint.getAttribute("type") == "continuous":
             for key in ("lower", "upper"):
                 limit.removeAttribute(key)
+            kind, name = (joint.getAttribute(k) for k in ("type", "name"))
             notes.append(
-                f"joint {joint.getAttribute('name')} has a lower limit of {low:g} and "
-                f"an upper one of {high:g}: it is taken to have none"
+                f"{kind} joint {name} has a lower limit of {low:g} and an upper one of "
+                f"{high:g}: it is taken to have none"
             )
     return notes
 

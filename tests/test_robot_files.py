@@ -374,6 +374,9 @@ def test_what_other_readers_do_not_mind_is_read(tmp_path):
     assert own.plant.num_actuators() == 2
     assert np.isinf(own.joints[0].lower) and own.joints[1].lower == -3.0
     assert any("taken to have none" in note for note in own.file.notes)
+    wheel = text.replace('lower="1" upper="-1"', 'lower="-1" upper="1"', 1)
+    path.write_text(wheel.replace('type="revolute"', 'type="continuous"', 1))
+    assert np.isinf(read_robot(path).joints[0].lower)
     path = tmp_path / "variables.urdf"
     text = text.replace('mass value="1.0"', 'mass value="$(optenv ARM_MASS 1.5)"', 1)
     path.write_text(text)
