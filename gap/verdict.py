@@ -115,6 +115,11 @@ def _closed_in_simulation(f: Facts) -> bool:
     return _before(g) > UNEXPLAINED_RMS and g.after <= AGREEMENT_RMS_MAX  # type: ignore[union-attr]
 
 
+def _agree_in_simulation(f: Facts) -> bool:
+    """Simulated windows show nothing, and the equations hardly more than smoothing."""
+    return f.start <= UNEXPLAINED_RMS and 0.0 < _before(f.chosen_on) <= NOISE_RMS_MAX
+
+
 def _not_simulated(f: Facts) -> bool:
     return f.chosen_on is None or not f.chosen_on.is_measured
 
@@ -127,7 +132,8 @@ def _said(text: str) -> Callable[[Facts], str]:
 Row = tuple[Callable[[Facts], bool], str, Callable[[Facts], str]]
 WITHOUT_EFFECTS: Sequence[Row] = (
     (lambda f: f.far or not (f.start <= max(AGREEMENT_RMS_MAX, NOISE_RMS_MAX)
-                             or f.below <= UNEXPLAINED_RMS), "gap_unnamed", _said("")),
+                             or f.below <= UNEXPLAINED_RMS or _agree_in_simulation(f)),
+     "gap_unnamed", _said("")),
     # Among many others one that is off would not show.
     (lambda f: f.loud[1] > max(f.loud_max, UNEXPLAINED_RMS), "gap_unnamed",
      lambda f: f" {f.loud[0]} is off by {figure(f.loud[1], 2)} times its noise."),

@@ -58,7 +58,7 @@ from makebreak.gap.report.clock import zero_of
 from makebreak.gap.report.summary import says_of
 from makebreak.gap.residuals.command_times import set_command_times
 from makebreak.gap.residuals.contact_problem import ContactProblem
-from makebreak.gap.residuals.driven import DrivenProblem, is_driven, sticks
+from makebreak.gap.residuals.driven import DrivenProblem, is_driven
 from makebreak.gap.residuals.impacts import ImpactProblem, runs_against, without_contact
 from makebreak.gap.residuals.late_poses import contact_problem
 from makebreak.gap.residuals.lying_on_faces import point_on_face
@@ -388,18 +388,6 @@ def problem_for(
                 impacts = ImpactProblem(scene, recordings)
                 return impacts, set_command_times(impacts)
             except DoesNotFit:  # Too few touches to tell.
-                pass
-        if is_driven(scene, recordings):
-            try:
-                driven = DrivenProblem(scene, recordings)
-                # Equations say less about drives: where windows leave nothing, neither
-                # do they.
-                if driven.is_explained():
-                    return driven, []
-                if driven.looped or sticks(scene, recordings):
-                    driven.learn_misfit()
-                    return driven, []
-            except DoesNotFit:  # It takes Drake's steps.
                 pass
         return equations_of(scene, recordings, dynamics, jobs)
     if any(joint.num_velocities() for joint in one_dof_joints(dynamics.plant)):

@@ -186,22 +186,24 @@ def _gear(plant: MultibodyPlant, model: str) -> Gear:
     return Gear(n_q + at, slow, 2.0 * dt * mobility[at])
 
 
-def _check_stiffness(plant: MultibodyPlant, drive, joints, names) -> None:
-    """Raises: ValueError if a drive stops a joint faster than can be simulated, as it
-    does if the model lacks the motor's rotor."""
-    damping, driven = drive
-    context, dt = plant.CreateDefaultContext(), plant.time_step()
-    mobility = np.diag(np.linalg.inv(plant.CalcMassMatrix(context)))
-    for joint, name, d, is_driven in zip(joints, names, damping, driven, strict=True):
-        inertia = 1.0 / mobility[joint.velocity_start()]
-        least = d * dt if dt else 0.5 * d / FASTEST
-        if is_driven and inertia < least:
-            raise ValueError(
-                f"actuation: the drive of {name} damps with {d:.3g} N m s/rad, and the "
-                f"joint has {inertia:.2g} kg m2, too little for that to be simulated "
-                f"(expected {least:.2g} or more): give it its rotor (an effect "
-                "rotor_inertia, its inertia times the gear ratio squared)"
-            )
+def check_stiffness(
+    mobility: float, damping: float, joint: str, time_step: float = 0.0
+) -> None:
+    """Raises: ValueError if a drive stops its joint faster than can be simulated, as it
+    does if the model lacks the motor's rotor.
+
+    Args: mobility: of the joint where it is [1/(kg m2)]. time_step: of Drake's own
+        steps [s]; 0: it has none.
+    """
+    inertia = 1.0 / mobility
+    least = damping * time_step if time_step else 0.5 * damping / FASTEST
+    if inertia < least:
+        raise ValueError(
+            f"actuation: the drive of {joint} damps with {damping:.3g} N m s/rad, and "
+            f"the joint has {inertia:.2g} kg m2, too little for that to be simulated "
+            f"(expected {least:.2g} or more): give it its rotor (an effect "
+            "rotor_inertia, its inertia times the gear ratio squared)"
+        )
 
 
 def _drive(
@@ -219,7 +221,13 @@ def _drive(
     law = whole[np.array([of.get(name, 0) for name in names])]
     joints = [motor_joint(plant, a.joint()) or a.joint() for a in actuators]
     if actuation.type in STIFF_TYPES:
-        _check_stiffness(plant, [law.kd + law.emf, driven], joints, names)
+        M = plant.CalcMassMatrix(plant.CreateDefaultContext())
+        mobility = np.diag(np.linalg.inv(M))
+        for k in np.flatnonzero(driven):
+            check_stiffness(
+                mobility[joints[k].velocity_start()], law.kd[k] + law.emf[k], names[k],
+                plant.time_step(),
+            )  # fmt: skip
     n_q = plant.num_positions()
     offsets = [effect for effect in effects if KINDS[effect.kind].channel == "offset"]
     maps = channel_maps(offsets, CHANNEL_STEPS, [f"{name}.position" for name in names])

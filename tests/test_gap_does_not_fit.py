@@ -11,7 +11,7 @@ from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.residuals import contact_problem, driven, mechanism, objects
 
 # Of joints alone, and beside free bodies: the order in which problems are asked.
-OF_JOINTS = ["PressingProblem", "ImpactProblem", "DrivenProblem", "MechanismProblem"]
+OF_JOINTS = ["PressingProblem", "ImpactProblem", "MechanismProblem"]
 OF_BODIES = ["contact_problem", "TouchProblem", "FlightProblem", "RolloutProblem"]
 
 
@@ -29,7 +29,7 @@ def with_problems(monkeypatch, first_that_fits, order, error=DoesNotFit):
             )
 
         monkeypatch.setattr(workflow, name, make)
-    for name in ("presses", "runs_against", "is_driven"):
+    for name in ("presses", "runs_against"):
         monkeypatch.setattr(workflow, name, lambda *_: True)
     monkeypatch.setattr(workflow, "push_each_other", lambda *_: False)
     is_mechanism = order is OF_JOINTS

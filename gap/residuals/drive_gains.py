@@ -63,7 +63,7 @@ def gain_columns(model) -> tuple[list[np.ndarray], list[float], list[str]]:
     """Columns (m,) of the residual of an InverseModel, standard deviations and names:
     what each gain gives, per share of it."""
     columns, prior, names = [], [], []
-    share = float(model.scene.tolerance.get(KEY, 0.0))
+    share = gains_known_to(model.scene)
     joints = [j for j, told in zip(model.joints, model.commanded, strict=True) if told]
     for joint in joints if share else ():
         i = model.joints.index(joint)

@@ -65,8 +65,6 @@ from makebreak.models.effects.signature import Motion
 from makebreak.models.scene import Scene
 from makebreak.models.scene_schema import COMMANDS_OF
 
-# A joint below this speed is at rest; one that is for this share of the time sticks.
-REST_SPEED, REST_SEC, STICKS = 0.005, 0.2, 0.2
 # A drive's position loop keeps a simulation near: it forgets its start. Without one
 # errors add up.
 WINDOW_SEC, WITHOUT_LOOP_SEC, MOST_WINDOWS = 2.0, 0.5, 60
@@ -818,26 +816,6 @@ def is_driven(scene: Scene, recordings: Sequence[Recording]) -> bool:
             if not any(f"{joint}.{what}" in recording for what in takes):
                 return False
     return True
-
-
-def sticks(scene: Scene, recordings: Sequence[Recording]) -> bool:
-    """Whether a joint stands still for much of the time."""
-    for joint in scene.actuation.joints:
-        still, whole = 0.0, 0.0
-        for recording in recordings:
-            channel = recording.channels[f"{joint}.position"]
-            for episode in recording.episodes:
-                y, t = recording.samples(channel.name, episode)[::-1]
-                n = int(REST_SEC / max(float(np.median(np.diff(t))), 1e-6))
-                if len(y) <= n or n < 2:
-                    continue
-                spans = np.lib.stride_tricks.sliding_window_view(y, n)
-                off = np.ptp(spans, axis=1)
-                still += np.sum(off < REST_SPEED * REST_SEC + 4.0 * channel.noise)
-                whole += len(off)
-        if whole and still > STICKS * whole:
-            return True
-    return False
 
 
 def _jumps(time: np.ndarray, x: np.ndarray) -> np.ndarray:

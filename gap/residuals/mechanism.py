@@ -21,6 +21,7 @@ from makebreak.gap.problem import (
     rms,
     share_left,
 )
+from makebreak.gap.residuals.drive_gains import KEY as GAINS
 from makebreak.gap.residuals.drive_gains import with_moved_gains
 from makebreak.gap.residuals.inverse import InverseModel
 from makebreak.gap.residuals.mechanism_candidates import (
@@ -34,6 +35,7 @@ from makebreak.gap.residuals.mechanism_candidates import (
 from makebreak.gap.residuals.mechanism_measure import measure
 from makebreak.gap.residuals.pushes import ROBUST, Push, find_pushes
 from makebreak.gap.residuals.where import unexplained, where_in_motion
+from makebreak.gap.residuals.whitened_rows import REST_SHARE
 from makebreak.gap.result import GapMeasure, Series, Where
 from makebreak.gap.simulation.windows import Window
 from makebreak.gap.thresholds import (
@@ -54,6 +56,11 @@ from makebreak.models.scene import Scene
 # right. A weight is changed where it would become less by this share.
 MISFIT, LESS = 1.3, 0.8
 LOUD = 1.5  # Rms over noise of one joint's rows that is looked into by itself.
+# Speeds [rad/s, m/s] below which a joint may be held, by what is left in test functions
+# of which so much is rest, if there are so many; and twice the log likelihood that
+# another must gain.
+RESTS, HELD_SHARE, FEW, REST_EVIDENCE = 0.005 * 2.0 ** np.arange(6), 0.7, 10, 20.0
+MOST_WEIGHINGS = 10
 AT_REST = 2.0  # Times the least uncertainty: rows with more are of joints at rest.
 RICH_PRIOR = 10.0  # Times a nuisance's tolerance, in a rich model.
 # What is left of a measured effort is noise where less than this share of it repeats,
@@ -102,8 +109,8 @@ class MechanismProblem(InverseModel, GapProblem):
         if self.noise_error(left) < MISFIT:
             return
         self._found = candidates(self, n, left)
-        for _ in range(5):
-            n = self.nuisances()
+        for _ in range(MOST_WEIGHINGS):
+            n = _without_gains(self.nuisances())
             rich = rich_columns(self, self._found)
             prior = RICH_PRIOR * n.prior
             screen = Screen(self.base(), n.columns, prior, self.train())
@@ -114,6 +121,10 @@ class MechanismProblem(InverseModel, GapProblem):
             if len(pushes) > len(self.pushes):
                 self._set_pushes(pushes, unbent)
                 continue  # What they bent is fitted again.
+            if to_new := self.hold(*self._held_in(unbent)):
+                self._base = None
+                self._reexpress(to_new)
+                continue
             error = self._misfit(left)
             # A rich model may do worse than none, where noise is all that is left; and
             # what one more effect of the catalogue explains is nothing models lack.
@@ -125,6 +136,35 @@ class MechanismProblem(InverseModel, GapProblem):
                 break
             self._set(error)
         self.correlation = self._correlation(left)
+
+    def _held_in(self, left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(n_joints,) speeds below which friction may hold a joint, and by how much
+        [N m]: the most likely ones, given what a rich model leaves (m,)."""
+        units, now = self.in_units(left), self.noise_in_units()
+        noise = self.noise_in_units(held=False)
+        speeds, most = np.array(self._rest), np.array(self._hold)
+        for i in range(len(self.joints)):
+            u, own, least = units[:, i], noise[:, i], np.inf
+            at_first = np.isnan(self._hold[i])
+            for speed in (self._rest[i], *RESTS):
+                share = np.concatenate([self.at_rest(t, speed)[:, i]
+                                        for t in self.tracks])  # fmt: skip
+                moves, rests = share < REST_SHARE, share > HELD_SHARE
+                if min(moves.sum(), rests.sum()) < FEW:
+                    continue
+                free = own**2 + beyond_noise(u[moves], own[moves]) ** 2
+                if np.isinf(least):  # As it is now.
+                    held = now[:, i] ** 2 - own**2
+                    least = _surprise(u, free + held) - REST_EVIDENCE
+                    continue
+                size = float(rms(u[rests] / share[rests]))
+                if size**2 < np.median(free):
+                    continue
+                cost = _surprise(u, free + (share * size) ** 2)
+                # At first the fastest, as a fit to all bends to rows of joints at rest.
+                if cost < least or (at_first and not np.isnan(most[i])):
+                    least, speeds[i], most[i] = min(cost, least), speed, size
+        return speeds, most
 
     def _settled(self, r: np.ndarray) -> np.ndarray:
         """What the nuisances leave of r (m,), free within their limits."""
@@ -708,6 +748,19 @@ def beyond_noise(off: np.ndarray, noise: np.ndarray) -> float:
     leave as much."""
     size, times = (ROBUST * np.median(np.abs(x)) for x in (off, off / noise))
     return float(size * np.sqrt(1.0 - 1.0 / times**2)) if times > MISFIT else 0.0
+
+
+def _without_gains(n: Nuisances) -> Nuisances:
+    """Nuisances but for gains of drives. Beside all that a joint may have they would be
+    of no use: no drive would leave nothing, nor does what the model needs, rescaled."""
+    kept = [k for k, name in enumerate(n.names) if not name.startswith(GAINS)]
+    return replace(n, columns=n.columns[:, kept], prior=n.prior[kept],
+                   names=tuple(n.names[k] for k in kept))  # fmt: skip
+
+
+def _surprise(off: np.ndarray, variance: np.ndarray) -> float:
+    """Minus twice the logarithm of the likelihood of rows (m,), but for a constant."""
+    return float(np.sum(np.log(variance) + off**2 / variance))
 
 
 def features_of(i: int, q, v, vd, effort, sign) -> np.ndarray:

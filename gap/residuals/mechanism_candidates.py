@@ -155,11 +155,14 @@ def rich_columns(model: InverseModel, found: Sequence[Candidate]) -> np.ndarray:
     last link: what a model that lacks nothing ordinary would have.
 
     A gain multiplies what the model needs: as a factor on the measured effort it would
-    cancel all of that, and with it what anything is off by.
+    cancel all of that, and with it what anything is off by; as a drive's own stiffness
+    would, beside it: that is no column.
     """
     last = list(model.dynamics.links())[-1:]
     columns = []
     for c in found:
+        if KINDS[c.kind].path == "kp":
+            continue
         if KINDS[c.kind].path == "gain":
             each = [
                 model.dynamics.signatures(c.kind, list(c.at), m)[0].columns

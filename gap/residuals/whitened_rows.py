@@ -42,6 +42,10 @@ class WhitenedRows(MechanismMotion):
         # of a model with effects, divided by its drives' gains.
         self._weighed_by, self._divided_by = self.dynamics, np.ones(len(self.joints))
         self._more: list[np.ndarray] = []
+        # (n_joints,) Speeds below which joints may be held by any friction, and by how
+        # much [N m]; NaN: by REST_EFFORT of their rms effort.
+        self._rest = np.full(len(self.joints), REST_SPEED)
+        self._hold = np.full(len(self.joints), np.nan)
         self._noises = self._noise_of_rows()
         # What models are off by, beside noise [N m, rad/s].
         self.model_error = {
@@ -78,8 +82,9 @@ class WhitenedRows(MechanismMotion):
         direct = (kp * self.noise * g0) ** 2 + (MODEL_ERROR * rms) ** 2
         direct += np.array(self.by_measured) * (self.effort_noise * g_e) ** 2
         direct = direct + self._unknown_jumps(track) ** 2
-        rest = track.bumps.mean((np.abs(v) < REST_SPEED).astype(float))
-        held = np.where(rest > REST_SHARE, rest, 0.0) * REST_EFFORT * rms
+        rest = self.at_rest(track, self._rest)
+        untold = np.where(rest > REST_SHARE, rest, 0.0) * REST_EFFORT * rms
+        held = np.where(np.isnan(self._hold), untold, rest * self._hold)
         centre = np.clip(
             np.searchsorted(track.middle, track.bumps.centre), 0, len(q) - 1
         )
@@ -87,18 +92,24 @@ class WhitenedRows(MechanismMotion):
         for b, k in enumerate(centre):
             M = self._mass_matrix(q[k]) / self._divided_by[:, None]
             C[b] = (M * (g2 * self.noise) ** 2) @ M.T
-            C[b] += np.diag(direct[b] + held[b] ** 2)
+            C[b] += np.diag(direct[b])
         # The smoothed velocity's own error, as over one bump.
         own = self.noise * np.sqrt(period * 12.0 / track.bumps.width**3)
         v_std = np.hypot(self.velocity_noise * g_v * self._together, own)
         v_std = np.hypot(v_std, np.where(kd > 0.0, DRIVE_VELOCITY * rms_of(v), 0.0))
         return {
             "effort": C,
+            "held": held,
             "velocity": np.maximum(v_std, LEAST_STD),
             "effort_measured": np.maximum(
                 np.hypot(self.effort_noise * g_e, e_std), LEAST_STD
             ),
         }
+
+    def at_rest(self, track: Track, speed: np.ndarray | float) -> np.ndarray:
+        """(n_bumps, n_v) share of each bump in which joints are slower than this."""
+        _, v = track.motion_at_middles()
+        return track.bumps.mean((np.abs(v) < speed).astype(float))
 
     def _unknown_jumps(self, track: Track) -> np.ndarray:
         """(n_bumps, n_v) standard deviations of means of measured efforts that jump
@@ -123,7 +134,8 @@ class WhitenedRows(MechanismMotion):
         models are off by, and standard deviations of the other channels'."""
         out = []
         for noise in self._noises:
-            C = noise["effort"] + np.diag(error["effort"] ** 2)
+            more = noise["held"] ** 2 + error["effort"] ** 2
+            C = noise["effort"] + np.eye(len(self.joints)) * more[:, None]
             # An equation whose effort is not told says nothing, of others neither.
             C[:, self.untold] = C[:, :, self.untold] = 0.0
             C[:, self.untold, self.untold] = 1.0
@@ -155,6 +167,18 @@ class WhitenedRows(MechanismMotion):
         Args: dynamics: of a scene with effects. gains (n_joints,): of its drives.
         """
         self._weighed_by, self._divided_by = dynamics, gains
+        return self._noises_anew()
+
+    def hold(self, rest: np.ndarray, most: np.ndarray):
+        """Takes joints for held, below speeds rest (n_joints,), by any effort up to
+        most (n_joints,) [N m]. Returns: as of allow; None where it is none other."""
+        now = zip((rest, most), (self._rest, self._hold), strict=True)
+        if all(np.allclose(a, b, rtol=0.1, equal_nan=True) for a, b in now):
+            return None
+        self._rest, self._hold = rest, most
+        return self._noises_anew()
+
+    def _noises_anew(self) -> Callable[[np.ndarray], np.ndarray]:
         self._noises = self._noise_of_rows()
         for more in self._more:
             self._add_noise(more)
@@ -186,13 +210,16 @@ class WhitenedRows(MechanismMotion):
             -1, len(self.names())
         )
 
-    def noise_in_units(self) -> np.ndarray:
-        """(n_bumps, n_names) standard deviations that the sensors' noise gives."""
+    def noise_in_units(self, held: bool = True) -> np.ndarray:
+        """(n_bumps, n_names) standard deviations that the sensors' noise gives, and,
+        where `held`, friction of joints at rest."""
         others = self._other_names()
         found = []
         for noise in self._noises:
             C = noise["effort"]
             std = np.sqrt(np.einsum("bii->bi", C))
+            if held:
+                std = np.hypot(std, noise["held"])
             row = [noise[what][self.joints.index(joint)] for what, joint in others]
             found.append(np.hstack([std, np.tile(row, (len(C), 1))]))
         return np.concatenate(found)

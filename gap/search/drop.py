@@ -62,7 +62,9 @@ def drop_needless(
             error = search.error_without_floor if two else search.error
             gain = PAIR_GAIN if two else search.plan.least_gain
             gained = error(now.score) < (1.0 - gain) * error(smaller.score)
-            if not _stays(search, chosen[k], smaller.left, left, gained):
+            strains = search.is_strained(smaller) and not search.is_strained(current)
+            stays = strains or _stays(search, chosen[k], smaller.left, left, gained)
+            if not stays:
                 needless.append((smaller.score, k, smaller))
         if not needless:
             break

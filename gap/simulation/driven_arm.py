@@ -21,7 +21,9 @@ from makebreak.gap.simulation.scene_simulation import SceneSimulation
 from makebreak.gap.simulation.sensor_samples import SAME_SEC
 from makebreak.models.drives import (
     CHANNEL_STEPS,
+    STIFF_TYPES,
     actuators_of_model,
+    check_stiffness,
     drive_law,
     path_numbers,
 )
@@ -97,7 +99,15 @@ class DrivenArmScene:
             if possible is not None:
                 possible(effect, plant, every)
         arm = DrivenArm(**body_numbers, **self._drives(plant, every))
-        return arm._replace(law_p=self._law_p(plant, arm))
+        n = len(arm.parent)
+        names = {j.velocity_start(): full_name(plant, j) for j in one_dof_joints(plant)}
+        q = plant.GetPositions(plant.CreateDefaultContext())
+        mass_and_bias(arm, q, np.zeros(n), M := np.empty((n, n)), np.empty(n))
+        mobility = np.diag(np.linalg.inv(M))
+        if self.scene.actuation.type in STIFF_TYPES:
+            for i in np.flatnonzero(arm.driven == LOOP):
+                check_stiffness(mobility[i], arm.law[i, 1] + arm.law[i, 3], names[i])
+        return arm._replace(law_p=self._law_p(arm, mobility))
 
     @property
     def has_shapes(self) -> bool:
@@ -113,21 +123,16 @@ class DrivenArmScene:
             told,
         )
 
-    def _law_p(self, plant: MultibodyPlant, arm: DrivenArm) -> np.ndarray:
+    def _law_p(self, arm: DrivenArm, mobility: np.ndarray) -> np.ndarray:
         """(m, 4) with dry friction that holds: below a speed that is no more than these
         steps need, or with which a joint creeps in so far as the scene's does."""
         p = arm.law_p.copy()
-        dry = [j for j, kind in enumerate(arm.law_kind) if int(kind) in FADES_AT]
-        if not dry:
-            return p
-        n = len(arm.parent)
-        q = plant.GetPositions(plant.CreateDefaultContext())
-        mass_and_bias(arm, q, np.zeros(n), M := np.empty((n, n)), np.empty(n))
-        mobility = np.diag(np.linalg.inv(M))
-        for j in dry:
-            at, i = FADES_AT[int(arm.law_kind[j])], int(arm.law_joint[j])
-            creeps = self.creep_sec * np.abs(p[j, : min(at, 2)]).max() * mobility[i]
-            p[j, at] = max(HOLDS * p[j, at], creeps)
+        for j, kind in enumerate(arm.law_kind):
+            if int(kind) in FADES_AT:
+                at, i = FADES_AT[int(kind)], int(arm.law_joint[j])
+                most = np.abs(p[j, : min(at, 2)]).max()
+                creeps = self.creep_sec * most * mobility[i]
+                p[j, at] = max(HOLDS * p[j, at], creeps)
         return p
 
     def _plant(self, effects) -> tuple[MultibodyPlant, dict]:
@@ -136,9 +141,10 @@ class DrivenArmScene:
         if key not in self._plants:
             if len(self._plants) >= _MOST_KEPT:
                 self._plants.pop(next(iter(self._plants)))
-            loaded = load_scene(
-                replace(self.scene, effects=list(effects)), DiagramBuilder()
-            )
+            # Joints' own rotors come later: until then no drive is one that fits them.
+            undriven = replace(self.scene.actuation, type="effort")
+            scene = replace(self.scene, actuation=undriven, effects=list(effects))
+            loaded = load_scene(scene, DiagramBuilder())
             self._plants[key] = loaded.plant, _tree(loaded.plant)
         return self._plants[key]
 
