@@ -12,6 +12,7 @@ from makebreak.gap.problem import Candidate
 from makebreak.gap.residuals import mechanism_measure
 from makebreak.gap.residuals.driven import DrivenProblem, is_driven
 from makebreak.gap.residuals.mechanism import MechanismProblem
+from makebreak.gap.residuals.mechanism_candidates import rich_columns
 from makebreak.gap.search.groups import groups_of
 from makebreak.gap.search.select import select
 from makebreak.gap.simulation import driven_arm
@@ -380,3 +381,64 @@ def test_links_within_their_tolerance_explain_a_joint_that_a_weak_drive_lets_sag
     problem = DrivenProblem(weak, read_recordings([file]))
     assert problem.noise_error(problem.base()) > 20.0
     assert problem.is_explained()
+
+
+def test_a_joint_at_rest_may_be_held_by_any_friction(tmp_path):
+    """Of drives that take efforts, at rest half of the time: what friction does then is
+    between its two limits, and creeping joints (as MuJoCo's) seem to move."""
+    joints = ["d.j1", "d.j2"]
+    scene = with_effects(
+        replace(double(tmp_path), actuation=ActuationSection("effort", joints=joints)),
+        ("rotor_inertia", "d", dict(inertia=0.05)),
+        ("joint_viscous_damping", "d", dict(damping=0.3)),
+    )
+    hidden = [("joint_coulomb_friction", ["d.j1"], dict(coulomb=1.2)),
+              ("joint_coulomb_friction", ["d.j2"], dict(coulomb=0.4))]  # fmt: skip
+    truth = with_effects(scene, *hidden)
+    truth = replace(truth, effects=[*scene.effects, *truth.effects[-2:]])
+    time, names = np.arange(0.0, 30.0, 0.002), [f"{j}.position" for j in joints]
+    slow = np.sin(0.5 * time) > -0.2
+    told = np.array([4.0, 1.2])[:, None] * slow * np.array([
+        np.sin(2.1 * time) * np.sin(0.31 * time), np.sin(2.9 * time + 1.0)
+    ])  # fmt: skip
+    simulation = DrivenArmSimulation(truth)
+    simulation.set_creep(1e-3)
+    columns = {f"{j}.effort_command": u for j, u in zip(joints, told, strict=True)}
+    rows = simulation.run(at_rest_but({}), time, names, Commands(time, columns))
+    rows = rows + 1e-4 * np.random.default_rng(1).normal(size=rows.shape)
+    file = tmp_path / "recording.csv"
+    np.savetxt(
+        file, np.column_stack([time, rows, *told]), delimiter=",", comments="",
+        header=",".join(["time", *names, *columns]),
+    )  # fmt: skip
+    problem, _ = problem_for(scene, read_recordings([file]), SceneDynamics(scene))
+    true = [Effect(*each) for each in hidden]
+    assert problem.noise_error(problem.residual(true)) < 3.0
+    found = {tuple(c.effect.at): c.effect for c in select(problem).choices}
+    assert set(found) == {("d.j1",), ("d.j2",)}
+    for kind, at, p in hidden:
+        assert found[tuple(at)].kind == kind
+        assert found[tuple(at)].parameters["coulomb"] == pytest.approx(
+            p["coulomb"], rel=0.01
+        )
+
+
+def test_all_that_joints_may_have_is_no_arm_without_a_drive(tmp_path):
+    """Columns of a rich model must not cancel a drive's own law: neither its gain, nor
+    no load with no gain, leaves nothing."""
+    joints = ["d.j1", "d.j2"]
+    drives = ActuationSection(type="servo", joints=joints, kp=[60.0, 20.0], kd=[6.0, 2])
+    scene = replace(double(tmp_path), actuation=drives)
+    hidden = ("joint_coulomb_friction", "d", dict(coulomb=0.5))
+    truth = with_effects(scene, hidden)
+    time, told = goals(2, np.random.default_rng(3))
+    noise = np.random.default_rng(4)
+    file, _ = log_of(
+        truth, joints, tmp_path, time, told,
+        lambda rows: rows + 1e-4 * noise.normal(size=rows.shape),
+    )  # fmt: skip
+    problem = MechanismProblem(scene, read_recordings([file]))
+    assert problem._found
+    rich = rich_columns(problem, problem._found)
+    back = np.linalg.lstsq(rich, problem.base(), rcond=1e-10)[0]
+    assert rms(problem.in_noise(problem.base() - rich @ back)) > 0.1
