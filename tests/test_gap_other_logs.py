@@ -165,6 +165,11 @@ def test_commands_that_hold_or_damping_are_no_samples(scene, tmp_path):
     recordings = read_recordings([log_of_a_fast_loop(tmp_path)])
     problem = MechanismProblem(read_scene(scene), recordings)
     assert problem.commands_are_samples()
+    # Commands that are stamped by another clock, by a fifth of a row.
+    late = log_of_a_fast_loop(tmp_path, effort_late=0.003)
+    assert MechanismProblem(
+        read_scene(scene), read_recordings([late])
+    ).commands_are_samples()
     held = sampled_commands.as_samples(recordings)
     assert not MechanismProblem(read_scene(scene), held).commands_are_samples()
     path = log(tmp_path, "b", 14, damping=0.5)

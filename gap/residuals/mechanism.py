@@ -380,7 +380,7 @@ class MechanismProblem(InverseModel, GapProblem):
         )
 
     def commands_are_samples(self) -> bool:
-        """Whether commanded efforts fit half a period earlier: a loop that is faster
+        """Whether commanded efforts fit half a period earlier, or a bit more: a loop that is faster
         than the table gave them, and a row has what it gave at that instant. What else
         makes them seem early (damping that the scene has too much of) does not say so
         at half a period, to the noise or to half of what is left."""
@@ -402,10 +402,12 @@ class MechanismProblem(InverseModel, GapProblem):
             each = np.median(np.abs(off).reshape(-1, len(self.names())), axis=0)
             return np.array([rms(off), ROBUST * rms(each)])
 
-        held, less, half, more = (left(periods) for periods in (0.0, 0.25, 0.5, 0.75))
+        shifts = (0.0, 0.25, 0.5, 0.75, 1.0)
+        held, less, half, more, whole = (left(periods) for periods in shifts)
+        half = np.minimum(half, more)  # Stamps of two topics differ by a part of a row.
         gained = len(self.base()) * (held**2 - half**2)
         enough = np.maximum(NOISE_RMS_MAX, (1.0 - CLOSED_SHARE_MIN) * held)
-        is_half = (half < less) & (half < more) & (half <= enough)
+        is_half = (half < less) & (half < whole) & (half <= enough)
         is_sure = gained > BESIDE_NOISE_EVIDENCE * self.correlation**2
         return bool((is_half & is_sure).any())
 
