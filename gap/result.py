@@ -238,6 +238,12 @@ class GapMeasure:
         return bool(np.isfinite(self.before) and np.isfinite(self.after))
 
     @property
+    def stops_with_effects(self) -> bool:
+        """Whether every window can be simulated without the effects, and none with."""
+        before, after = self.failed
+        return before == 0 and 0 < self.n_windows == after
+
+    @property
     def reduction(self) -> float:
         """Share of what simulated windows show above the floor that is closed."""
         return self._closed(self.before, self.after)

@@ -630,7 +630,7 @@ def _withdrawn(
         why = "Another direction of gravity explains more."
     elif facts.chosen_on is None:
         why = _TOO_SHORT_TO_CHOOSE
-    elif not facts.chosen_on.is_measured:
+    elif not facts.chosen_on.is_measured or facts.chosen_on.stops_with_effects:
         why = f"It could not be judged by simulation. {facts.chosen_on.failure}"
     if why:
         return [(choice, why) for choice in selection.choices]

@@ -1,6 +1,7 @@
 """`no_gap` is said where every measured channel was compared, and nowhere else."""
 
 import csv
+import json
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from test_gap_contact import touched
 
 from makebreak.gap.problem import DISTANCES
 from makebreak.gap.workflow import run_gap
+from makebreak.scripts.cli import commands as cli
 
 
 def with_columns(recording, more: dict[str, np.ndarray]):
@@ -73,3 +75,26 @@ def test_with_the_channel_left_out_it_is_no_gap_again(pendulum, tmp_path):
     if noise.exists():
         (tmp_path / "noise.json").write_text(noise.read_text())
     assert run_gap(pendulum / "scene.yaml", [copy]).verdict == "no_gap"
+
+
+ROD = """<robot name="arm"><link name="base"/><link name="rod"><inertial>
+<origin xyz="0 0 -0.2"/><mass value="1"/>
+<inertia ixx="1e-3" iyy="1e-3" izz="1e-3" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="j1" type="continuous"><parent link="base"/><child link="rod"/>
+<axis xyz="0 1 0"/></joint></robot>"""
+
+
+def test_effects_with_which_nothing_can_be_simulated_are_not_named(tmp_path):
+    """Efforts that go with the angle alone: a spring on a rod without a mass."""
+    (tmp_path / "arm.urdf").write_text(ROD)
+    time = np.arange(0.0, 3.0, 0.01)
+    q = 0.3 * np.sin(5.0 * time)
+    np.savetxt(
+        tmp_path / "log.csv", np.column_stack([time, q, 1.78 * q]), delimiter=",",
+        header="time,j1_position,j1_effort", comments="", fmt="%.6f",
+    )  # fmt: skip
+    assert cli.main(["gap", str(tmp_path / "arm.urdf"), str(tmp_path / "log.csv"),
+                 "--out", str(tmp_path / "out")]) in (0, 1, 3)  # fmt: skip
+    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert result["effects"] == [] and result["verdict"] == "gap_unnamed"
+    assert any("could not be judged by simulation" in t["why"] for t in result["tried"])
