@@ -380,10 +380,11 @@ class MechanismProblem(InverseModel, GapProblem):
         )
 
     def commands_are_samples(self) -> bool:
-        """Whether commanded efforts fit half a period earlier, or a bit more: a loop that is faster
-        than the table gave them, and a row has what it gave at that instant. What else
-        makes them seem early (damping that the scene has too much of) does not say so
-        at half a period, to the noise or to half of what is left."""
+        """Whether commanded efforts fit half a period earlier, or a bit more: a loop
+        that is faster than the table gave them, and a row has what it gave at that
+        instant. What else makes them seem early (damping that the scene has too much
+        of) does not say so at half a period, to the noise or to half of what is
+        left."""
         given = [j for j, has in zip(self.joints, self.has["effort_command"],
                                      strict=True) if has]  # fmt: skip
         if not given or any(law is not None for law in self.laws):
