@@ -172,7 +172,13 @@ def test_commands_that_hold_or_damping_are_no_samples(scene, tmp_path):
     ).commands_are_samples()
     held = sampled_commands.as_samples(recordings)
     assert not MechanismProblem(read_scene(scene), held).commands_are_samples()
-    path = log(tmp_path, "b", 14, damping=0.5)
+    # Whatever else the scene lacks.
+    path = log(tmp_path, "c", 14, damping=0.5)
+    path.write_text(path.read_text().replace("effort_measured", "effort_command"))
+    damped = MechanismProblem(read_scene(scene), read_recordings([path]))
+    assert damped.commands_are_samples()
+    # What holds for a row is the law's effort of the row's middle.
+    path = log(tmp_path, "b", 14, damping=0.5, effort_late=-0.0025)
     path.write_text(path.read_text().replace("effort_measured", "effort_command"))
     damped = MechanismProblem(read_scene(scene), read_recordings([path]))
     assert not damped.commands_are_samples()

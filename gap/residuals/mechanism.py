@@ -37,6 +37,7 @@ from makebreak.gap.residuals.pushes import ROBUST, Push, find_pushes
 from makebreak.gap.residuals.where import unexplained, where_in_motion
 from makebreak.gap.residuals.whitened_rows import REST_SHARE
 from makebreak.gap.result import GapMeasure, Series, Where
+from makebreak.gap.simulation.channel_effects import PATH, SENSED
 from makebreak.gap.simulation.windows import Window
 from makebreak.gap.thresholds import (
     BESIDE_NOISE_EVIDENCE,
@@ -390,8 +391,10 @@ class MechanismProblem(InverseModel, GapProblem):
         if not given or any(law is not None for law in self.laws):
             return False
         kind = next(k for k, entry in KINDS.items() if entry.path == "delay")
-        n = self.nuisances()
-        screen = Screen(self.base(), n.columns, n.prior, self.train(), reach=n.reach)
+        n, train = self.nuisances(), self.train()
+        # What joints may lack beside it hides when efforts act.
+        lacks = [c for c in self._found or () if c.kind not in (*SENSED, *PATH)]
+        rich = rich_columns(self, lacks)
         written = min(r.period_sec() for r in self.recordings)  # Rows may be means.
 
         def left(periods: float) -> np.ndarray:
@@ -399,7 +402,8 @@ class MechanismProblem(InverseModel, GapProblem):
             channel, as most joints may be at rest."""
             late = Effect(kind, given, {"delay": -periods * written})
             r = self.residual([late]) if periods else self.base()
-            off = self.in_noise(screen.fit_nuisances(r)[1])
+            fit = Screen(r, n.columns, n.prior, train, reach=n.reach).fit(rich)
+            off = self.in_noise(r - rich @ fit.c - n.columns @ fit.b)
             each = np.median(np.abs(off).reshape(-1, len(self.names())), axis=0)
             return np.array([rms(off), ROBUST * rms(each)])
 
