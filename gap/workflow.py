@@ -270,7 +270,10 @@ def _compared(
     checks += [*done, *found]
     seconds["screen"] = clock.lap()
     say("searching the catalogue")
-    selection = select(problem, say)
+    # Of a driven robot windows may have to be searched as well.
+    searched = budget.share(2) if is_driven(scene, decided) else budget
+    with searched.running():
+        selection = select(problem, say)
     seconds["select"] = clock.lap()
     say("simulating held-out windows")
     reported = excerpt(reported, REPORTED_SEC, REPORTED_ROWS) if reported else []
@@ -292,10 +295,12 @@ def _compared(
         except DoesNotFit:
             return first
         say("searching the catalogue in another way")
-        then = select(other, say)
+        with budget.share(1).running() as own:
+            then = select(other, say)
         named = conclude(other, then, reported, [*checks, *found], jobs)
         if named.verdict in ("gap_unnamed", "not_judged"):
             return first
+        searched.undone[:] = own.undone
         return other, then, named
 
     def between_impacts(problem: FlightProblem) -> GapResult:
@@ -340,6 +345,8 @@ def _compared(
         )
         again = again if problem is was else equations_of
         seconds["other way"] = clock.lap()
+    for undone in searched.undone:
+        budget.leave(undone)
     if isinstance(problem, MechanismProblem):
         what = "comparing recordings one by one"
         result = budget.if_time(what, one_by_one, result)
