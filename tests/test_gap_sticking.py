@@ -67,13 +67,22 @@ def goals(n, rng):
     return time, out
 
 
-def log_of(truth, joints, folder, time, told, read):
+def encoders(seed, std):
+    """Positions (m, n) as noisy encoders read them."""
+    rng = np.random.default_rng(seed)
+    return lambda rows: rows + std * rng.normal(size=rows.shape)
+
+
+def log_of(truth, joints, folder, time, told, read, what="position", creep=0.0):
     """The log of a scene that follows commands told (n, m), as encoders `read` its
     positions (m, n); names of the positions."""
     names = [f"{joint}.position" for joint in joints]
-    columns = {f"{j}.position_command": u for j, u in zip(joints, told, strict=True)}
-    rows = DrivenArmSimulation(truth).run(
-        at_rest_but(dict(zip(joints, told[:, 0], strict=True))),
+    columns = {f"{j}.{what}_command": u for j, u in zip(joints, told, strict=True)}
+    start = told[:, 0] if what == "position" else np.zeros(len(joints))
+    simulation = DrivenArmSimulation(truth)
+    simulation.set_creep(creep)
+    rows = simulation.run(
+        at_rest_but(dict(zip(joints, start, strict=True))),
         time, names, Commands(time, columns),
     )  # fmt: skip
     file = folder / "recording.csv"
@@ -373,11 +382,7 @@ def test_links_within_their_tolerance_explain_a_joint_that_a_weak_drive_lets_sag
     moved = ("object_com", "d.lower", at | {"x": at["x"] + 0.05, "z": at["z"] - 0.02})
     truth = with_effects(weak, moved)
     time, told = goals(2, np.random.default_rng(3))
-    noise = np.random.default_rng(4)
-    file, _ = log_of(
-        truth, joints, tmp_path, time, told,
-        lambda rows: rows + 2e-4 * noise.normal(size=rows.shape),
-    )  # fmt: skip
+    file, _ = log_of(truth, joints, tmp_path, time, told, encoders(4, 2e-4))
     problem = DrivenProblem(weak, read_recordings([file]))
     assert problem.noise_error(problem.base()) > 20.0
     assert problem.is_explained()
@@ -396,21 +401,14 @@ def test_a_joint_at_rest_may_be_held_by_any_friction(tmp_path):
               ("joint_coulomb_friction", ["d.j2"], dict(coulomb=0.4))]  # fmt: skip
     truth = with_effects(scene, *hidden)
     truth = replace(truth, effects=[*scene.effects, *truth.effects[-2:]])
-    time, names = np.arange(0.0, 30.0, 0.002), [f"{j}.position" for j in joints]
+    time = np.arange(0.0, 30.0, 0.002)
     slow = np.sin(0.5 * time) > -0.2
     told = np.array([4.0, 1.2])[:, None] * slow * np.array([
         np.sin(2.1 * time) * np.sin(0.31 * time), np.sin(2.9 * time + 1.0)
     ])  # fmt: skip
-    simulation = DrivenArmSimulation(truth)
-    simulation.set_creep(1e-3)
-    columns = {f"{j}.effort_command": u for j, u in zip(joints, told, strict=True)}
-    rows = simulation.run(at_rest_but({}), time, names, Commands(time, columns))
-    rows = rows + 1e-4 * np.random.default_rng(1).normal(size=rows.shape)
-    file = tmp_path / "recording.csv"
-    np.savetxt(
-        file, np.column_stack([time, rows, *told]), delimiter=",", comments="",
-        header=",".join(["time", *names, *columns]),
-    )  # fmt: skip
+    file, _ = log_of(
+        truth, joints, tmp_path, time, told, encoders(1, 1e-4), "effort", creep=1e-3
+    )
     problem, _ = problem_for(scene, read_recordings([file]), SceneDynamics(scene))
     true = [Effect(*each) for each in hidden]
     assert problem.noise_error(problem.residual(true)) < 3.0
@@ -432,11 +430,7 @@ def test_all_that_joints_may_have_is_no_arm_without_a_drive(tmp_path):
     hidden = ("joint_coulomb_friction", "d", dict(coulomb=0.5))
     truth = with_effects(scene, hidden)
     time, told = goals(2, np.random.default_rng(3))
-    noise = np.random.default_rng(4)
-    file, _ = log_of(
-        truth, joints, tmp_path, time, told,
-        lambda rows: rows + 1e-4 * noise.normal(size=rows.shape),
-    )  # fmt: skip
+    file, _ = log_of(truth, joints, tmp_path, time, told, encoders(4, 1e-4))
     problem = MechanismProblem(scene, read_recordings([file]))
     assert problem._found
     rich = rich_columns(problem, problem._found)

@@ -1,10 +1,9 @@
-"""A mechanism whose drives follow commands and whose joints stick, by its windows.
+"""A mechanism whose drives follow commands, by its windows: the other way of its
+equations of motion (mechanism.py), where these leave a gap without a name.
 
-A joint at rest only says that friction is at most so much, and without a measured
-effort its equation says what the drive's law makes of its own error: equations of
-motion mislead. Here windows are simulated by compiled code
-(gap/simulation/driven_arm.py), a hundred times as fast as by Drake, and what effects
-would do is seen by differences.
+Without a measured effort an equation says what the drive's law makes of its own error.
+Here windows are simulated by compiled code (gap/simulation/driven_arm.py), a hundred
+times as fast as by Drake, and what effects would do is seen by differences.
 """
 
 from collections.abc import Callable, Sequence

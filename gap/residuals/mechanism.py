@@ -144,12 +144,15 @@ class MechanismProblem(InverseModel, GapProblem):
         units, now = self.in_units(left), self.noise_in_units()
         noise = self.noise_in_units(held=False)
         speeds, most = np.array(self._rest), np.array(self._hold)
+        shares = [
+            np.concatenate([self.at_rest(t, speed) for t in self.tracks])
+            for speed in (self._rest, *RESTS)
+        ]
         for i in range(len(self.joints)):
             u, own, least = units[:, i], noise[:, i], np.inf
             at_first = np.isnan(self._hold[i])
-            for speed in (self._rest[i], *RESTS):
-                share = np.concatenate([self.at_rest(t, speed)[:, i]
-                                        for t in self.tracks])  # fmt: skip
+            for speed, at_rest in zip((self._rest[i], *RESTS), shares, strict=True):
+                share = at_rest[:, i]
                 moves, rests = share < REST_SHARE, share > HELD_SHARE
                 if min(moves.sum(), rests.sum()) < FEW:
                     continue
