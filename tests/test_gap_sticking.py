@@ -11,7 +11,7 @@ from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.problem import Candidate
 from makebreak.gap.residuals import mechanism_measure
 from makebreak.gap.residuals.driven import DrivenProblem, is_driven
-from makebreak.gap.residuals.mechanism import MechanismProblem
+from makebreak.gap.residuals.mechanism import MechanismProblem, _without_gains
 from makebreak.gap.residuals.mechanism_candidates import rich_columns
 from makebreak.gap.search.groups import groups_of
 from makebreak.gap.search.select import select
@@ -436,3 +436,12 @@ def test_all_that_joints_may_have_is_no_arm_without_a_drive(tmp_path):
     rich = rich_columns(problem, problem._found)
     back = np.linalg.lstsq(rich, problem.base(), rcond=1e-10)[0]
     assert rms(problem.in_noise(problem.base() - rich @ back)) > 0.1
+    # Nor may gains that are known to a share cancel it: they are no part of that model.
+    n = problem.nuisances()
+    beside = _without_gains(n)
+    of_gains = [name.startswith("drive_gains of d.j") for name in n.names]
+    assert sum(of_gains) == 4 and len(of_gains) > 4
+    links = np.flatnonzero(~np.array(of_gains))
+    assert beside.names == tuple(n.names[k] for k in links)
+    np.testing.assert_array_equal(beside.columns, n.columns[:, links])
+    np.testing.assert_array_equal(beside.prior, n.prior[links])
