@@ -1207,6 +1207,40 @@ KINDS |= {
     "cells in round brackets": in_tuples,
     "units in cells and names": as_text(with_units, ""),
 }
+
+
+def gears_of_their_own(log: Log):
+    for i, gear in enumerate(log.rng.choice([50.0, 80.0, 101.0, 121.0], log.joints)):
+        if not log.slides[i]:
+            log.columns[f"joint{i + 1}_position"] *= gear
+            log.columns[f"joint{i + 1}_velocity"] *= gear
+            log.columns[f"joint{i + 1}_effort"] /= gear
+    return ("on the motor's side of a gear",)
+
+
+def reversed_encoder(log: Log):
+    """Position and velocity count the other way, and the effort does not."""
+    i = int(np.argmax(np.std(log.weight, axis=0) * ~np.array(log.slides)))
+    for what in ("position", "velocity"):
+        log.columns[f"joint{i + 1}_{what}"] *= -1.0
+    if not np.std(log.weight[:, i]) > 0.0:  # Nothing tells it from a reversed effort.
+        log.truth = {}
+    return ("counts the other way", "other sign")
+
+
+def tared(log: Log):
+    """Efforts begin at 0, whatever the robot weighs there."""
+    for name in names(log, "effort"):
+        log.columns[name] = log.columns[name] - log.columns[name][0]
+    return ("was taken from them",)
+
+
+KINDS |= {
+    # A sixth time.
+    "a gear for each joint": gears_of_their_own,
+    "an encoder reversed": reversed_encoder,
+    "efforts tared": tared,
+}
 UNSEEN = list(KINDS)[list(KINDS).index("one velocity in degrees") :]
 
 

@@ -350,17 +350,6 @@ def test_left_and_right_legs_taken_for_each_other_are_asked_about(tmp_path):
             assert said == {}
 
 
-def test_positions_of_a_gear_for_each_joint_are_asked_about(tmp_path):
-    def on_motors_side(columns):
-        for k, gear in enumerate((50.0, 101.0, 160.0), start=1):
-            columns[f"joint{k}_position"] = gear * columns[f"joint{k}_position"]
-            columns[f"joint{k}_velocity"] = gear * columns[f"joint{k}_velocity"]
-            columns[f"joint{k}_effort"] = columns[f"joint{k}_effort"] / gear
-
-    found = judged(tmp_path, on_motors_side)
-    assert "each of a gear of its own?" in found["units_unsure"]
-
-
 def test_efforts_in_parts_of_unknown_ratings_are_asked_about(tmp_path):
     """Two of three joints could be explained by nothing but their unit."""
 

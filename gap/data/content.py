@@ -20,7 +20,7 @@ from itertools import combinations, permutations
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
-from scipy.optimize import linear_sum_assignment, lsq_linear, minimize_scalar
+from scipy.optimize import linear_sum_assignment, minimize_scalar, nnls
 
 from makebreak.gap.data.findings import Finding
 from makebreak.gap.data.match import AS_SAID, JointName, Match
@@ -40,7 +40,6 @@ MOST_SEC = 60.0  # Of a log that is looked at.
 EXPLAINS, NOTHING = 0.9, 0.5  # Shares of what is predicted: is told by it, is not.
 CLEARER = 5.0  # Times less is left by another joint's column than by its own.
 TOLD_WELL = 0.01  # Of what is predicted: no other unit can tell it much better.
-NEARLY_ALL = 1e-4  # The same where a unit is but told by how large numbers are.
 LEAST_LEFT = 1e-5  # Less is rounding.
 GIVES_WAY = 0.05  # [rad], [m]
 LEAST_TOLD = 0.3  # Of a column that is not noise, to judge it without that.
@@ -51,26 +50,25 @@ ALIKE, SIGMAS = 0.03, 3.0
 # A search takes factors of drives between these for a gain of the actuator; without a
 # gain, masses would have to make up for others.
 GAINS = (0.45, 1.6)
-# Shares of an effort that is the weight's, to tell by; of the weight that one without
-# it may still have.
-WEIGHS, LEFT_OUT = 0.1, 0.2
+WEIGHS = 0.1  # Of what a joint needs: an offset that is clear, or next to none.
 FEW, MOST_LATE = 100, 300  # Instants at which many readings, or delays, are tried.
-# Joints of which all orders are tried, those of which swaps are, and those that may be
-# off where one has another zero.
-ALL_ORDERS, MOST_ORDERED, MOST_OFF = 6, 8, 8
+ALL_ORDERS, MOST_ORDERED = 6, 8  # Joints of which all orders, or swaps, are tried.
 ROOM = 0.1  # Of a joint's range, beyond it.
-# Logarithms: of gears that are tried, and the step between two.
-LARGEST_GEAR, GEAR_STEP = 5.7, 0.1
-ONE_GEAR = 0.03  # Of what is needed: what efforts behind one gear for all leave.
+ONE_GEAR = 0.03  # Of a gear: it is as round as that lets it be.
+GEARS, ROUNDS = (
+    (30.0, 60.0, 100.0, 160.0),
+    15,
+)  # From which, and in which, gears are found.
+LEAST_READ = 1e-4  # A share: of less no other reading is better.
+_MOTION = ("position", "velocity")
 FAR = 1000.0  # [rad] No joint turns by so much between its limits.
 LATEST_SEC, LATE_STEP_SEC = 0.1, 0.01
-NO_WEIGHT = 0.02  # Of what an effort without weight leaves at most.
 # Of one joint alone, what it carries may make its effort so many times larger; what
 # holds it up, smaller.
 LARGE, LARGER = 20.0, 3.0
 WITHOUT_WEIGHT = "effort_without_weight"
 UNSURE, UNITS_UNSURE, LATE = "effort_unsure", "units_unsure", "effort_late"
-FROM_A_START = "position_from_start"
+FROM_A_START, TARED = "position_from_start", "effort_tared"
 AT_ZERO = 1e-3  # [rad], [m]
 UNEXPLAINED, MIRRORED = "effort_unexplained", "joints_mirrored"
 _UNSURE = (
@@ -84,6 +82,7 @@ _SEVERITY = {
     UNITS_UNSURE: "warning",
     LATE: "warning",
     FROM_A_START: "warning",
+    TARED: "warning",
     UNEXPLAINED: "warning",
     MIRRORED: "warning",
 }  # Else: an error.
@@ -105,6 +104,44 @@ class Likeness:
     factor: float
     std: float
     explained: float
+
+
+@dataclass(frozen=True)
+class Told:
+    """What a joint needs = factor effort + bias - friction - rotor, but for a share."""
+
+    left: float
+    factor: float
+    bias: float
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """How positions are read: those of joints `order` (n,), times scale (n,), which is
+    below 0 of those that count the other way, plus zero (n,) [rad]. weightless: efforts
+    have no part of the robot's weight."""
+
+    order: tuple[int, ...]
+    scale: np.ndarray
+    zero: np.ndarray
+    weightless: bool = False
+
+    @staticmethod
+    def as_is(n: int) -> "Reading":
+        """Of n joints, as their matches have them."""
+        return Reading(tuple(range(n)), np.ones(n), np.zeros(n))
+
+    def scaled(self, joints: Sequence[int], factors) -> "Reading":
+        """With these joints' positions times factors."""
+        times = np.ones(len(self.scale))
+        times[list(joints)] = factors
+        return replace(self, scale=times * self.scale, zero=times * self.zero)
+
+    def turned(self, i: int, angle: float) -> "Reading":
+        """With another zero of a joint."""
+        zero = self.zero.copy()
+        zero[i] += angle
+        return replace(self, zero=zero)
 
 
 @dataclass(frozen=True)
@@ -210,50 +247,36 @@ class Contents:
             raise TooShort("too short to tell what columns are by what is in them")
         self._even, _, _, self._kernels, states = averaged
         self._some = slice(None, None, max(len(states[0]) // MOST_SAMPLES, 1))
-        self._motion = [x[self._some].copy() for x in states]
+        self._motion = [x[self._some] for x in states]
         self.late = 0.0  # [s] How late columns are taken to be.
-        self.take(*self._motion)
+        self.read(Reading.as_is(len(names)))
 
-    def take(self, q: np.ndarray, v: np.ndarray, vd: np.ndarray) -> None:
-        """(m, n_q) as the joints' positions, velocities and accelerations."""
-        self.q, self.v, self.vd = q, v, vd
-        self.needed = needed_efforts(self._plant, q, v, vd)
-        self._weight: np.ndarray | None = None
+    def read(self, reading: "Reading") -> None:
+        """With the measured joints' positions read so."""
+        order = list(reading.order)
+        self.reading = reading
+        self.q, self.v, self.vd = (x[:, order] * reading.scale for x in self._motion)
+        self.q = self.q + reading.zero
+        self.needed = needed_efforts(self._plant, self.q, self.v, self.vd)
+        if reading.weightless:
+            self.needed = self.needed - self.weight()
 
-    @property
     def weight(self) -> np.ndarray:
         """(m, n_q) what gravity needs of the joints."""
-        if self._weight is None:
-            context = self._plant.CreateDefaultContext()
-            self._weight = np.empty_like(self.needed)
-            for k, q in enumerate(self.q):
-                self._plant.SetPositions(context, q)
-                tau = self._plant.CalcGravityGeneralizedForces(context)
-                self._weight[k] = -tau
-        return self._weight
-
-    def moved(self, order: Sequence[int]) -> None:
-        """With the measured joints in another order."""
-        self.take(*(x[:, list(order)] for x in self._motion))
-
-    def scaled(self, joints: Sequence[int], factor: float) -> None:
-        """With the positions of these joints times a factor."""
-        for x in self._motion:
-            x[:, list(joints)] *= factor
-        self.take(*self._motion)
-
-    def turned(self, i: int, angle: float) -> None:
-        """With another zero of a joint."""
-        self._motion[0][:, i] += angle
-        self.take(*self._motion)
+        context = self._plant.CreateDefaultContext()
+        out = np.empty_like(self.q)
+        for k, q in enumerate(self.q):
+            self._plant.SetPositions(context, q)
+            out[k] = -self._plant.CalcGravityGeneralizedForces(context)
+        return out
 
     def fewer(self, m: int) -> "Contents":
         """At about m instants."""
         k = max(len(self.q) // m, 1)
         other = copy(self)
         other._some = slice(None, None, k * self._some.step)
-        other._motion = [x[::k].copy() for x in self._motion]
-        other.take(*other._motion)
+        other._motion = [x[::k] for x in self._motion]
+        other.read(self.reading)
         return other
 
     def is_inside(self) -> bool:
@@ -284,6 +307,11 @@ class Contents:
         even = np.interp(self._even + self.late, self._all_time[there], y[there])
         return np.convolve(even, self._kernels[0], "valid")[self._some]
 
+    def raw(self, name: str) -> np.ndarray:
+        """Its samples in the rows that are looked at."""
+        y = self._columns[name][self._rows[0] : self._rows[-1] + 1]
+        return y[np.isfinite(y)]
+
     def of_velocity(self, name: str, i: int) -> Likeness | None:
         y = self.column(name)
         one = np.ones((len(self.v), 1))
@@ -298,41 +326,20 @@ class Contents:
         halves = [self.column(name, half) for half in (0, 1)]
         return likeness(self.needed[:, i], y, np.stack(rest, axis=1), halves)
 
-    def left_by_friction(self, name: str, i: int) -> float:
-        """Share of what a joint needs that a column, a bias and friction, which never
-        drives, leave."""
-        y, v = self.column(name), self.v[:, i]
-        if y is None or not np.ptp(y) > 0.0:
-            return 1.0
-        against = [-np.abs(v).max() * v, -np.sign(v)]
-        X = np.stack([y, np.ones_like(v), *against], axis=1)
-        X /= np.maximum(np.abs(X).max(axis=0), 1e-300)
-        needed = self.needed[:, i]
-        low = [-np.inf, -np.inf, 0.0, 0.0]
-        off = lsq_linear(X, needed, (low, np.inf)).fun
-        return float(off @ off / max(np.var(needed) * len(v), 1e-300))
-
-    def lacks_weight(self, name: str, i: int) -> bool | None:
-        """Whether an effort has what the motion needs and not what the weight does;
-        None where the two look alike, or it does not go with them."""
-        y, v, weight = self.column(name), self.v[:, i], self.weight[:, i]
-        if y is None or np.std(weight) < WEIGHS * np.std(self.needed[:, i]):
-            return None
-        rest = np.stack([np.ones_like(v), v, np.sign(v)], axis=1)
-        X = np.column_stack([self.needed[:, i] - weight, weight, rest])
-        left = y - X @ np.linalg.lstsq(X, y, rcond=1e-9)[0]
-        alone = y - rest @ np.linalg.lstsq(rest, y, rcond=1e-9)[0]
-        if not left @ left < (1.0 - EXPLAINS) * float(alone @ alone):
-            return None
-        each = [
-            np.linalg.lstsq(A, b, rcond=1e-9)[0][:2]
-            for A, b in zip(
-                np.array_split(X, PARTS), np.array_split(y, PARTS), strict=True
-            )
-        ]
-        motion, weighs = np.mean(each, axis=0)
-        std = np.std([b / motion for _, b in each]) / np.sqrt(PARTS)
-        return bool(abs(weighs / motion) < LEFT_OUT) if std < KNOWN_TO else None
+    def told(self, name: str, i: int) -> Told:
+        """What an effort tells beside a bias, friction and a rotor's inertia, which
+        never drive."""
+        y, needed = self.column(name), self.needed[:, i]
+        v, vd = self.v[:, i], self.vd[:, i]
+        if y is None or not (np.ptp(y) > 0.0 and np.ptp(needed) > 0.0):
+            return Told(1.0, 1.0, 0.0)
+        one = np.ones_like(v)
+        X = np.stack([y, -y, one, -one, -v, -np.sign(v), -vd], axis=1)
+        size = np.maximum(np.abs(X).max(axis=0), 1e-300)
+        c, off = nnls(X / size, needed)
+        c = c / size
+        left = off**2 / (np.var(needed) * len(v))
+        return Told(float(left), float(c[0] - c[1]), float(c[2] - c[3]))
 
 
 def _range(y: np.ndarray) -> float:
@@ -361,15 +368,12 @@ def by_content(
         return matches, said
     except ValueError:
         return matches, said
-    matches = _rightly_signed(contents, matches, said)
-    _without_weight(contents, matches, said)
     matches = _rightly_ordered(contents, matches, said)
     matches = _all_ordered(contents, matches, said)
-    matches = _from_their_zeros(contents, matches, said)
-    _mirrored(contents, matches, said)
+    matches = _rightly_read(contents, matches, said)
     matches = _drives_that_drive(contents, matches, said)
-    matches = _in_other_units(contents, matches, said)
     matches = _with_factors(contents, matches, said)
+    matches = _tared(contents, matches, said)
     _unexplained(contents, matches, said)
     _late(contents, matches, said)
     _from_a_start(contents, matches, said)
@@ -409,167 +413,6 @@ def _without_empty(columns, matches: Sequence[Match], said) -> list[Match]:
     return out
 
 
-# ----- What angles are counted in, and which way
-
-
-def _misfit(contents: Contents, efforts: Mapping[int, str], rotor=False) -> float:
-    """Mean logarithm of the shares that efforts do not explain. rotor: as of
-    of_effort."""
-    each = [contents.of_effort(name, i, rotor) for i, name in efforts.items()]
-    left = [1.0 if x is None else 1.0 - x.explained for x in each]
-    return float(np.mean(np.log(np.maximum(left, LEAST_LEFT))))
-
-
-def _in_other_units(contents: Contents, matches, said) -> list[Match]:
-    """Angles that are counted in turns, in steps of an encoder, or on the motor's side
-    of one gear, by the efforts: of what swings they go with the sine. Much less is then
-    left of them, and the limits allow it."""
-    efforts = _columns_of(contents, matches, _DRIVES)
-    mine = _columns_of(contents, matches, ("position",))
-    group = [i for i in mine if not contents.joints[i].prismatic]
-    before = _misfit(contents, efforts, True) if efforts and group else -np.inf
-    sized = any(m.told.endswith(BY_SIZE) for m in matches if m.column in mine.values())
-    if before < np.log(NEARLY_ALL if sized else TOLD_WELL):
-        return matches
-    few = contents.fewer(FEW)
-
-    def left(log_factor: float) -> float:
-        few.scaled(group, np.exp(log_factor))
-        out = _misfit(few, efforts, True) if few.is_inside() else 0.0
-        few.scaled(group, np.exp(-log_factor))
-        return out
-
-    scales = {m.column: abs(m.scale) for m in matches}
-    scale = scales[mine[group[0]]]
-    far = float(np.ptp(contents.q[:, group], axis=0).max()) > FAR
-    known = [u for u in (TURNING if sized or far else [Unit("turns", TURN)])
-             if abs(np.log(u.factor / scale)) > ALIKE]  # fmt: skip
-    tried = [float(np.log(u.factor / scale)) for u in known]
-    # Of rad that lie within the limits nobody asks for a gear.
-    tried += [*np.arange(-LARGEST_GEAR, LARGEST_GEAR, GEAR_STEP)] if sized else []
-    if not tried:
-        return matches
-    best = min(tried, key=left)
-    if sized:
-        near = (best - GEAR_STEP, best + GEAR_STEP)
-        best = minimize_scalar(left, bounds=near, method="bounded").x
-    unit = next(
-        (u for u in known if abs(best - np.log(u.factor / scale)) < ALIKE), None
-    )
-    gear = _round(np.exp(-best) / scale, 0.005 * np.exp(-best) / scale)
-    factor = (1.0 / gear if unit is None else unit.factor) / scale
-    contents.scaled(group, factor)
-    after = _misfit(contents, efforts, True)
-    # Of gears that differ, one in between tells half of it.
-    clearer, most = (2.0, 1.0 - EXPLAINS) if unit else (CLEARER, ONE_GEAR)
-    if (
-        not contents.is_inside()
-        or abs(np.log(factor)) < ALIKE
-        or after > min(np.log(most), before - np.log(clearer))
-    ):
-        contents.scaled(group, 1.0 / factor)
-        if (sized or far) and before > np.log(1.0 - EXPLAINS):
-            which = ", ".join(mine[i] for i in group)
-            says = (
-                f"{which} are too large for rad, and by the efforts in no unit that is "
-                "known, nor on the motor's side of one gear: each of a gear of its "
-                "own? Then give each its scale in the sidecar."
-            )
-            said.append(Said(UNITS_UNSURE, contents.joints[group[0]].name, 0.0, says))
-        return matches
-    names = {contents.joints[i].name for i in group}
-    speeds = _columns_of(contents, matches, ("velocity",))
-    found = {i: contents.of_velocity(speeds[i], i) for i in group if i in speeds}
-    alike = {
-        contents.joints[i].name for i, x in found.items() if x is not None
-        and abs(abs(x.factor) / scales[speeds[i]] / factor - 1.0) < KNOWN_TO
-    }  # fmt: skip
-    word = f"in {unit.name}" if unit else f"{gear:g} times as large as at the joint"
-    word += "" if unit else ", as on the motor's side of a gear"
-    out, moved = [], []
-    for m in matches:
-        at, _, what = (m.channel or "").rpartition(".")
-        here = "position" in what and at in names or what == "velocity" and at in alike
-        if m.why != AS_SAID and here:
-            why = f"{m.why}; {word}, by the efforts"
-            m = replace(m, scale=m.scale * factor, offset=m.offset * factor, why=why)
-            moved.append(m.column)
-        out.append(m)
-    says = f"By the efforts that go with them, {', '.join(moved)} are {word}."
-    said.append(Said("units", contents.joints[group[0]].name, factor, says))
-    return out
-
-
-def _rightly_signed(contents: Contents, matches, said) -> list[Match]:
-    """A position that contradicts both its velocity and its effort has the wrong sign,
-    and not these two."""
-    efforts, out = _columns_of(contents, matches, _DRIVES), list(matches)
-    for k, m in enumerate(matches):
-        at, _, what = (m.channel or "").rpartition(".")
-        i = next((i for i, j in enumerate(contents.joints) if j.name == at), None)
-        if what != "velocity" or m.scale > 0.0 or m.why == AS_SAID or i not in efforts:
-            continue
-        before, all_before = contents.of_effort(efforts[i], i), _fit(contents, efforts)
-        contents.scaled([i], -1.0)
-        after = contents.of_effort(efforts[i], i)
-        if (
-            before is None or after is None or not before.factor < 0.0 < after.factor
-            or after.explained < EXPLAINS or _fit(contents, efforts) < all_before - 0.05
-        ):  # fmt: skip
-            contents.scaled([i], -1.0)
-            continue
-        out[k] = replace(m, scale=-m.scale, why=f"{m.why}; no, its position is")
-        for n, other in enumerate(out):
-            if other.channel in (f"{at}.position", f"{at}.position_command"):
-                why = f"{other.why}; of the other sign than velocity and effort say"
-                out[n] = replace(
-                    other, scale=-other.scale, offset=-other.offset, why=why
-                )
-        says = (
-            f"The position of {at} is of the other sign than velocity and effort say."
-        )
-        said.append(Said("position_sign", f"{at}.position", -1.0, says))
-    return out
-
-
-# ----- Without gravity
-
-
-def _without_weight(contents: Contents, matches, said) -> None:
-    """Of efforts that a controller adds the robot's weight to, the others are judged as
-    such: the motion then needs no more."""
-    names = [j.name for j in contents.joints]
-    lacks = {}
-    for m in matches:
-        at, _, what = (m.channel or "").rpartition(".")
-        if what in _DRIVES and at in names and contents.moves(names.index(at)):
-            lacks[m.column, at] = contents.lacks_weight(m.column, names.index(at))
-    told = [x for x in lacks.values() if x is not None]
-    if not told or not all(told):
-        return
-    efforts = _columns_of(contents, matches, _DRIVES)
-    n, with_weight = len(names), contents.needed
-    best = _assigned(_left(efforts, contents.of_effort, n), efforts)[1]
-    as_they_are = [contents.of_effort(name, i) for i, name in efforts.items()]
-    if best < np.log(TOLD_WELL) and all(
-        x is not None and GAINS[0] < x.factor < GAINS[1] for x in as_they_are
-    ):
-        return  # In one swing, weight and motion go with the same sine.
-    contents.needed = with_weight - contents.weight
-    after = _assigned(_left(efforts, contents.of_effort, n), efforts)[1]
-    # Another direction of gravity leaves more.
-    if after > min(best, np.log(NO_WEIGHT)):
-        contents.needed = with_weight  # Swapped columns may look like it.
-        return
-    column, at = next(key for key, x in lacks.items() if x)
-    says = (
-        f"{column} has what the motion of {at} needs, and nothing of the weight: as "
-        "what a controller commands that carries the robot's weight by itself. A scene "
-        "without gravity (plant: {gravity: [0, 0, 0]}) goes with it."
-    )
-    said.append(Said(WITHOUT_WEIGHT, at, 0.0, says))
-
-
 # ----- Whose column it is
 
 
@@ -583,10 +426,10 @@ def _rightly_ordered(contents: Contents, matches, said) -> list[Match]:
     if order is not None:
         before = _fit(contents, efforts)
         moved = [int(k) for k in np.argsort(order)]
-        contents.moved(moved)
+        contents.read(replace(contents.reading, order=tuple(moved)))
         if _fit(contents, efforts) > before + 0.2:
             return _reordered(contents, matches, ("position",), moved, said)
-        contents.moved(range(n))
+        contents.read(Reading.as_is(n))
         matches = _reordered(contents, matches, ("velocity",), order, said)
     order = _order(efforts, contents.of_effort, n)
     if order is not None:
@@ -686,7 +529,7 @@ def _all_ordered(contents: Contents, matches, said) -> list[Match]:
     few = contents.fewer(FEW)
 
     def left(order: Sequence[int]) -> float:
-        few.moved(order)
+        few.read(replace(few.reading, order=tuple(order)))
         if not few.is_inside():
             return 0.0
         return _misfit(few, {i: efforts[k] for i, k in enumerate(order)})
@@ -705,78 +548,250 @@ def _all_ordered(contents: Contents, matches, said) -> list[Match]:
                 near.append(tuple(other))
             best = min(near, key=left)
             order = best if left(best) < least else order
-    contents.moved(order)
+    contents.read(replace(contents.reading, order=tuple(order)))
     after = _misfit(contents, {i: efforts[k] for i, k in enumerate(order)})
     if after > min(np.log(1.0 - EXPLAINS), before - np.log(CLEARER)):
-        contents.moved(range(n))
+        contents.read(Reading.as_is(n))
         return matches
     every = ("position", "velocity", *_DRIVES, "position_command", "velocity_command")
     return _reordered(contents, matches, every, order, said)
 
 
-def _from_their_zeros(contents: Contents, matches, said) -> list[Match]:
-    """With a joint's zero a quarter or half a turn elsewhere, where the model then
-    explains the efforts."""
-    efforts = _columns_of(contents, matches, _DRIVES)
-    before = _misfit(contents, efforts) if efforts else -np.inf
-    if before < np.log(TOLD_WELL):
-        return matches
-    each = {i: contents.of_effort(name, i) for i, name in efforts.items()}
-    off = [i for i, x in each.items() if x is None or x.explained < EXPLAINS]
-    if len(off) > MOST_OFF:
-        return matches
-    few, found = contents.fewer(FEW), {}
+# ----- How positions are read
+
+
+def _misfit(contents: Contents, efforts: Mapping[int, str]) -> float:
+    """Mean logarithm of the shares that efforts leave."""
+    left = [x.left for x in _all_told(contents, efforts).values()]
+    return float(np.mean(np.log(np.maximum(left, LEAST_LEFT))))
+
+
+def _rightly_read(contents: Contents, matches, said) -> list[Match]:
+    """Positions read as the efforts go with them: joints that count the other way, or
+    from another zero, on the motor's side of gears or in another unit, and a robot that
+    something else carries. All are tried, the one that leaves least is taken, and all
+    are tried again."""
+    efforts = {i: name for i, name in _columns_of(contents, matches, _DRIVES).items()
+               if contents.moves(i)}  # fmt: skip
     mine = _columns_of(contents, matches, ("position",))
-    for i in (i for i in mine if not contents.joints[i].prismatic):
-        for angle in (0.25 * TURN, -0.25 * TURN, 0.5 * TURN, -0.5 * TURN):
-            few.turned(i, angle)
-            if few.is_inside():
-                found[i, angle] = _misfit(few, efforts)
-            few.turned(i, -angle)
-    if not found:
-        return matches
-    i, angle = min(found, key=lambda key: found[key])
-    contents.turned(i, angle)
-    if _misfit(contents, efforts) > min(
-        np.log(1.0 - EXPLAINS), before - np.log(CLEARER)
+    turn = [i for i in mine if not contents.joints[i].prismatic]
+    of = {m.column: m for m in matches}
+    far = float(np.ptp(contents.q[:, turn], axis=0).max(initial=0.0)) > FAR
+    sized = far or any(of[mine[i]].told.endswith(BY_SIZE) for i in turn)
+    few = contents.fewer(FEW)
+    reading, now = few.reading, _all_told(few, efforts)
+    while True:
+        if max((x.left for x in now.values()), default=0.0) < TOLD_WELL and not (
+            sized and _geared_factors(now)[0]
+        ):
+            break
+        best, most = None, 0.0
+        for other, is_gear in _readings(few, reading, efforts, turn, of, mine, sized):
+            few.read(other)
+            then = _all_told(few, efforts)
+            gain = _gain(now, then, is_gear)
+            if gain > most and (other.weightless or few.is_inside()):
+                best, most, after = other, gain, then
+        if best is None:
+            break
+        reading, now = best, after
+    contents.read(reading)
+    return _as_read(contents, matches, mine, efforts, now, sized, said)
+
+
+def _all_told(contents: Contents, efforts: Mapping[int, str]) -> dict[int, Told]:
+    return {i: contents.told(name, i) for i, name in efforts.items()}
+
+
+def _gain(before, after: Mapping[int, Told], is_gear: bool) -> float:
+    """How much less another reading leaves, as a logarithm; 0 where that is not
+    clear."""
+    differ = _geared_factors(before)[1]
+    less = {
+        i: np.log(max(x.left, LEAST_READ) / max(after[i].left, LEAST_READ))
+        for i, x in before.items()
+    }
+    other = [i for i, x in less.items() if abs(x) > np.log(1.0 + KNOWN_TO)]
+    gain = float(sum(less.values()))
+    if min(less.values()) < -np.log(2.0) or any(
+        after[i].left > 1.0 - EXPLAINS for i in other
     ):
-        contents.turned(i, -angle)
-        return matches
-    at, word = contents.joints[i].name, f"{np.rad2deg(angle):+.0f} deg"
-    says = f"By the efforts, the zero of {mine[i]} is another than that of {at}: taken "
-    says += f"{word}; or what carries it is turned so."
-    said.append(Said("position_zero", f"{at}.position", angle, says))
-    return [
-        replace(m, offset=m.offset + angle, why=f"{m.why}; {word}, by the efforts")
-        if m.channel in (f"{at}.position", f"{at}.position_command")
-        and m.why != AS_SAID else m
-        for m in matches
-    ]  # fmt: skip
+        return 0.0
+    # Signs of efforts that are wrong are another thing, and so are gears that differ.
+    turned = sum((x.factor < 0.0) - (after[i].factor < 0.0) for i, x in before.items())
+    clear = 2.0 * np.log(CLEARER) if not is_gear else 0.0 if differ else np.log(2.0)
+    return gain + turned if gain > clear else 0.0
 
 
-def _mirrored(contents: Contents, matches, said) -> None:
-    """Says where joints that turn the other way would explain the efforts: all of such
-    a joint may be reversed, or left and right limbs are taken for each other."""
-    efforts = _columns_of(contents, matches, _DRIVES)
-    before = _misfit(contents, efforts) if efforts else -np.inf
-    if before < np.log(TOLD_WELL):
+def _geared_factors(told: Mapping[int, Told]) -> tuple[bool, bool]:
+    """Whether efforts look as on the motor's side of gears; of gears that differ."""
+    factors = np.array([max(abs(x.factor), 1e-9) for x in told.values()])
+    if not len(factors) or not np.median(factors) > GAINS[1]:
+        return False, False
+    return True, bool(np.ptp(np.log(factors)) > 2.0 * ALIKE)
+
+
+def _readings(few, reading: Reading, efforts, turn, of, mine, sized: bool):
+    """(another reading, whether it is of gears), each that is one step away."""
+    own = [i for i in turn if of[mine[i]].why != AS_SAID]
+    for i in (i for i in mine if of[mine[i]].why != AS_SAID):
+        yield reading.scaled([i], -1.0), False
+        for angle in (0.25, -0.25, 0.5, -0.5) if i in own else ():
+            yield reading.turned(i, angle * TURN), False
+    yield replace(reading, weightless=not reading.weightless), False
+    if not own:
         return
-    few, gains = contents.fewer(FEW), {}
-    start = _misfit(few, efforts)
-    for i in (i for i in efforts if not contents.joints[i].prismatic):
-        few.scaled([i], -1.0)
-        gains[i] = start - _misfit(few, efforts)
-        few.scaled([i], -1.0)
-    others = [i for i, gain in gains.items() if gain > np.log(CLEARER) / len(efforts)]
-    few.scaled(others, -1.0)
-    if _misfit(few, efforts) < min(np.log(1.0 - EXPLAINS), start - np.log(CLEARER)):
-        names = ", ".join(contents.joints[i].name for i in others)
+    scale = np.array([abs(of[mine[i]].scale * reading.scale[i]) for i in own])
+    for unit in TURNING if sized else [Unit("turns", TURN)]:
+        if np.abs(np.log(unit.factor / scale)).max() > ALIKE:
+            yield reading.scaled(own, unit.factor / scale), False
+    for power in (0.0, 1.0) if sized else ():
+        yield _geared(few, reading, efforts, own, scale, power), True
+
+
+def _geared(few, reading: Reading, efforts, own, scale, power: float) -> Reading:
+    """Positions on the motor's side of gears: where efforts need another factor than
+    the gear to a power, as behind it (1) or at the joint (0), the scale is off."""
+    best, least = np.zeros(len(own)), np.full(len(own), np.inf)
+    for gear in (*GEARS, None):  # Last from the best of each joint.
+        size = np.full(len(own), -np.log(gear)) if gear else best.copy()
+        for _ in range(ROUNDS):
+            few.read(reading.scaled(own, np.exp(size) / scale))
+            told = _all_told(few, efforts)
+            left = [told[i].left if i in told else 1.0 for i in own]
+            best = np.where(left < least, size, best)
+            least = np.minimum(left, least)
+            off = [np.log(max(abs(told[i].factor), 1e-9)) if i in told else np.nan
+                   for i in own]  # fmt: skip
+            step = -0.4 * (np.array(off) + power * size)
+            step[~np.isfinite(step)] = np.nan_to_num(np.nanmedian(step))
+            size = size + step
+    gears = [_round(x, ONE_GEAR * x / 6.0) for x in np.exp(-size)]
+    return reading.scaled(own, 1.0 / (np.array(gears) * scale))
+
+
+def _as_read(contents: Contents, matches, mine, efforts, told, sized, said):
+    """Matches with positions and velocities as they are read, and what is said."""
+    reading, names = contents.reading, [j.name for j in contents.joints]
+    backward = [i for i in mine if reading.scale[i] < 0.0]
+    whole = [i for i in backward if i in told and told[i].factor < 0.0]
+    if len(whole) > 1:
         says = (
-            f"The efforts would go with the motion if {names} turned the other way: "
+            "The efforts would go with the motion if "
+            f"{', '.join(names[i] for i in whole)} turned the other way: "
             "are left and right limbs taken for each other (columns in another order), "
             "or are these joints reversed? Put it right in the sidecar."
         )
-        said.append(Said(MIRRORED, contents.joints[others[0]].name, 0.0, says))
+        said.append(Said(MIRRORED, names[whole[0]], 0.0, says))
+        reading = reading.scaled(whole, -1.0)
+        contents.read(reading)
+        backward = [i for i in backward if i not in whole]
+    words: dict[int, list[str]] = {i: [] for i in mine}
+    for i in backward:
+        words[i].append("counted the other way")
+        says = (
+            f"By the efforts, {mine[i]} counts the other way than {names[i]}: its "
+            "position is of the other sign, and so is a velocity that goes with it."
+        )
+        said.append(Said("position_sign", f"{names[i]}.position", -1.0, says))
+    for i in mine:
+        if (angle := reading.zero[i]) != 0.0:
+            words[i].append(word := f"{np.rad2deg(angle):+.0f} deg")
+            says = (
+                f"By the efforts, the zero of {mine[i]} is another than that of "
+                f"{names[i]}: taken {word}; or what carries it is turned so."
+            )
+            said.append(Said("position_zero", f"{names[i]}.position", angle, says))
+    if reading.weightless:
+        says = (
+            f"{', '.join(efforts.values())} have what the motion needs, and nothing of "
+            "the weight: as what a controller commands that carries the robot's weight "
+            "by itself. A scene without gravity (plant: {gravity: [0, 0, 0]}) goes "
+            "with it."
+        )
+        said.append(Said(WITHOUT_WEIGHT, names[next(iter(efforts))], 0.0, says))
+    scale, of = np.abs(reading.scale), {m.column: m for m in matches}
+    scaled = [i for i in mine if abs(np.log(scale[i])) > 1e-9]
+    units: dict[str, list[int]] = {}
+    for i in scaled:
+        size = abs(of[mine[i]].scale) * scale[i]
+        unit = next((u for u in TURNING if abs(np.log(u.factor / size)) < 1e-9), None)
+        gear = f"{_round(1.0 / size, 1e-6 / size):g} times as large as at the joint"
+        word = f"{gear}, as on the motor's side of a gear"
+        word = f"in {unit.name}" if unit else word
+        words[i].append(word)
+        units.setdefault(word, []).append(i)
+    for word, own in units.items():
+        which = ", ".join(mine[i] for i in own)
+        says = f"By the efforts that go with them, {which} are {word}."
+        said.append(Said("units", names[own[0]], float(scale[own[0]]), says))
+    off = max((x.left for x in told.values()), default=0.0)
+    if sized and not scaled and off > 1.0 - EXPLAINS:
+        which = ", ".join(mine[i] for i in mine if not contents.joints[i].prismatic)
+        says = (
+            f"{which} are too large for rad, and by the efforts in no unit that is "
+            "known, nor on the motor's side of gears. Give each its scale in the "
+            "sidecar."
+        )
+        said.append(Said(UNITS_UNSURE, names[next(iter(mine))], 0.0, says))
+    out, number = [], {name: i for i, name in enumerate(names)}
+    for m in matches:
+        at, _, what = (m.channel or "").rpartition(".")
+        i = number.get(at, -1)
+        if m.why != AS_SAID and words.get(i) and what.split("_")[0] in _MOTION:
+            factor, zero = float(reading.scale[i]), float(reading.zero[i])
+            if what.startswith("velocity"):
+                x, zero = contents.of_velocity(m.column, i), 0.0
+                if x is None or abs(x.factor / (m.scale * factor) - 1.0) > KNOWN_TO:
+                    factor = float(np.sign(factor))
+            why = f"{m.why}; {', '.join(words[i])}, by the efforts"
+            m = replace(
+                m, scale=m.scale * factor, offset=m.offset * factor + zero, why=why
+            )
+        out.append(m)
+    return out
+
+
+def _tared(contents: Contents, matches, said) -> list[Match]:
+    """With the offsets that were taken from efforts: all that carry weight are 0 where
+    the log begins, or on average, and the model's weight is not."""
+    efforts = _columns_of(contents, matches, _DRIVES)
+    of = {m.column: m for m in matches}
+    found = []
+    each = {i: (name, contents.told(name, i)) for i, name in efforts.items()}
+    each = {i: x for i, x in each.items() if x[1].left < 1.0 - EXPLAINS}
+    if 2 * len(each) <= len(efforts):
+        return matches
+    for part in (slice(0, 1), slice(None)):
+        off, for_it, against = {}, 0, 0
+        for i, (name, told) in each.items():
+            m, needed = of[name], contents.needed[:, i]
+            zero = abs(told.factor * np.mean(contents.raw(name)[part]))
+            bias = told.bias - told.factor * m.offset / m.scale
+            most = WEIGHS * np.sqrt(np.mean(needed**2))
+            off[i] = bias
+            if abs(bias) > most and zero < 2.0 * WEIGHS * abs(bias):
+                for_it += 1
+            elif abs(np.mean(needed[part])) > 2.0 * most:
+                against += 1
+        found.append((for_it - 4 * against, off))
+    most_for, off = max(found, key=lambda x: x[0])
+    if not most_for > 0:
+        return matches
+    which = ", ".join(efforts[i] for i in off)
+    says = (
+        f"{which} begin at 0, or are 0 on average, while the weight is not: an offset "
+        "was taken from them (tared). Taken with what the model's weight needs there: "
+        f"plus {', '.join(f'{x:.4g}' for x in off.values())}; a load that the model "
+        "lacks hides in that."
+    )
+    said.append(Said(TARED, contents.joints[next(iter(off))].name, len(off), says))
+    back = {efforts[i]: x for i, x in off.items()}
+    return [
+        replace(m, offset=m.offset + back[m.column],
+                why=f"{m.why}; plus what was taken from it")
+        if m.column in back and m.channel else m for m in matches
+    ]  # fmt: skip
 
 
 # ----- What drives a joint
@@ -815,8 +830,8 @@ def _drives_that_drive(contents: Contents, matches, said) -> list[Match]:
     return out
 
 
-def _share(contents: Contents, column: str, i: int, rotor: bool = False) -> float:
-    found = contents.of_effort(column, i, rotor)
+def _share(contents: Contents, column: str, i: int) -> float:
+    found = contents.of_effort(column, i)
     return 0.0 if found is None else found.explained
 
 
@@ -861,8 +876,7 @@ def _with_factors(contents: Contents, matches, said) -> list[Match]:
 def _unexplained(contents: Contents, matches, said) -> None:
     """Says where efforts do not go with the motion, whatever they count in."""
     efforts = _columns_of(contents, matches, _DRIVES)
-    # In one swing a rotor's torque and the weight are the same.
-    left = {i: max(_share(contents, name, i), _share(contents, name, i, True))
+    left = {i: 1.0 - contents.told(name, i).left
             for i, name in efforts.items() if contents.moves(i)}  # fmt: skip
     off = [i for i, share in left.items() if share < NOTHING]
     if 2 * len(off) > len(left):
@@ -881,7 +895,7 @@ def _from_a_start(contents: Contents, matches, said) -> None:
     moving = [i for i in range(len(contents.joints)) if contents.moves(i)]
     if len(moving) < 2 or not (np.abs(contents.first[moving]) < AT_ZERO).all():
         return
-    if efforts and _misfit(contents, efforts, True) > np.log(TOLD_WELL):
+    if efforts and _misfit(contents, efforts) > np.log(TOLD_WELL):
         says = (
             "All positions begin at 0, and the efforts are not those that the model "
             "needs from there: do they count from where the log, or the robot, was "
@@ -899,7 +913,7 @@ def _late(contents: Contents, matches, said) -> None:
 
     def left(late: float) -> float:
         few.late = late
-        each = [few.left_by_friction(name, i) for i, name in efforts.items()]
+        each = [few.told(name, i).left for i, name in efforts.items()]
         return float(np.mean(np.log(np.maximum(each, LEAST_LEFT)))) if each else 0.0
 
     before = left(0.0)
@@ -928,7 +942,8 @@ def _factors(
         if x.explained > EXPLAINS and x.std < KNOWN_TO * abs(x.factor)
     }  # fmt: skip
     rated = {i: _rated(contents.joints[i], x.factor) for i, x in known.items()}
-    if len(rated) > 1 and all(rated.values()) and any(map(_is_odd, known.values())):
+    sizes = (replace(x, factor=abs(x.factor)) for x in known.values())
+    if len(rated) > 1 and all(rated.values()) and any(map(_is_odd, sizes)):
         part, word = next(filter(None, rated.values()))
         return {
             i: (float(np.sign(known[i].factor if i in known else 1.0)) * size, word)
@@ -944,7 +959,7 @@ def _factors(
             or _not_a_rotor(contents, found[i][0], i, x.factor)
         }  # fmt: skip
         middle, within = _one_factor(list(known.values()))
-        alike = within > 0.0 and (len(known) > 1 or abs(middle) > 1.0)
+        alike = within > 0.0 and (len(known) > 1 or abs(middle) > GAINS[1])
     odd = {i: x.factor for i, x in known.items() if _is_odd(x)}
     if not odd:
         return {}
