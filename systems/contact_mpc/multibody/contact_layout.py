@@ -1,7 +1,5 @@
 """The contacts of an LCS and their rows: how many forces lam has, in which order."""
 
-from dataclasses import replace
-
 import numpy as np
 
 from makebreak.systems.contact_mpc.multibody.contact_pair import (
@@ -125,7 +123,7 @@ class ContactLayout:
             raise ValueError(f"gap is {gap}, expected ({self.n_pairs},), finite [m]")
         of_row = self._pair_of[np.asarray(lcs.contact, dtype=int)]
         further = np.where(self.rows.normal > 0.0, gap[of_row], 0.0)
-        return replace(lcs, c=lcs.c + further / self._dt_sec, phi=lcs.phi + further)
+        return lcs.with_residual(further / self._dt_sec, further)
 
     def _names_of_rows(self, first) -> list[str]:
         names = [self.names[i] for i in first]

@@ -73,10 +73,16 @@ class LCS:
         """Number of contact forces."""
         return self.D.shape[1]
 
-    def with_residual(self, r_comp) -> "LCS":
-        """This LCS with the offset c + r_comp, r_comp (n_lam,) [m/s] (eq. 12)."""
-        lcs = object.__new__(LCS)  # The other fields have been checked.
-        vars(lcs).update(vars(self), c=_own("c", self.c + r_comp, (self.n_lam,)))
+    def with_residual(self, r_comp, phi_more=None) -> "LCS":
+        """This LCS with the offset c + r_comp, r_comp (n_lam,) [m/s] (eq. 12), and with
+        phi + phi_more (n_lam,) [m]."""
+        lcs, n = (
+            object.__new__(LCS),
+            (self.n_lam,),
+        )  # The other fields have been checked.
+        vars(lcs).update(vars(self), c=_own("c", self.c + r_comp, n))
+        if phi_more is not None:
+            vars(lcs).update(phi=_own("phi", self.phi + phi_more, n))
         return lcs
 
 
@@ -124,16 +130,28 @@ def opening_speed(lcs: LCS, x_next, noise=0.0):
         as none; infinite: all of it.
     Returns: zeros where the LCS does not say what its forces push along.
     """
-    speed = np.zeros(lcs.n_lam)
     if lcs.J is None or lcs.contact is None or np.isinf(noise):
-        return speed
+        return np.zeros(lcs.n_lam)
     along = lcs.J @ x_next[-lcs.J.shape[1] :]
-    with_gap = np.ones(lcs.n_lam, bool) if lcs.phi is None else np.isfinite(lcs.phi)
-    for contact in np.unique(lcs.contact):
-        of = (lcs.contact == contact) & with_gap
+    phi = np.zeros(lcs.n_lam) if lcs.phi is None else lcs.phi
+    return _opening(along, lcs.contact, phi, float(noise))
+
+
+@njit(cache=True)
+def _opening(along, contact, phi, noise):
+    """Args: along (n_lam,) speeds of the rows; phi: infinite where w holds no gap."""
+    n = len(along)
+    speed = np.zeros(n)
+    for i in range(n):
+        if not np.isfinite(phi[i]):
+            continue
+        total, least, count = 0.0, np.inf, 0
+        for j in range(n):
+            if contact[j] == contact[i] and np.isfinite(phi[j]):
+                total, least, count = total + along[j], min(least, along[j]), count + 1
         # The edges come in opposite pairs: their mean is the normal's speed.
-        slip = along[of].mean() - along[of].min()
-        speed[of] = np.sqrt(max(slip**2 - noise**2, 0.0))
+        slip = total / count - least
+        speed[i] = np.sqrt(max(slip**2 - noise**2, 0.0))
     return speed
 
 

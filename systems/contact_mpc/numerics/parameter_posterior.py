@@ -264,20 +264,26 @@ def updated(
     Returns: the belief as it was, and None, where no QP was solved.
     """
 
-    def tried(z):
+    def tried(z, below=np.inf):
+        """z, what it explains and the cost; None where that is not below `below`."""
+        off = z - belief.mean
+        cost = 0.5 * off @ belief.information @ off
+        if not cost < below:  # Whatever the loss, which is not negative.
+            return None
         try:
             found = explain(build(z), sample, loss)
         except (ValueError, RuntimeError):
             return None
-        if found is None:
+        if found is None or not cost + trust * found.loss < below:
             return None
-        off = z - belief.mean
-        return z, found, 0.5 * off @ belief.information @ off + trust * found.loss
+        return z, found, cost + trust * found.loss
 
-    begun = [each for each in map(tried, (belief.mean, *starts)) if each is not None]
-    if not begun:
+    best = tried(belief.mean)
+    for start in starts:
+        best = tried(start, np.inf if best is None else best[2]) or best
+    if best is None:
         return belief, None
-    z, found, cost = min(begun, key=lambda each: each[2])
+    z, found, cost = best
     more = np.zeros_like(belief.information)
     for _ in range(NEWTON_STEPS):
         of_z = changes(z, found.lcs, found.lam)
@@ -286,10 +292,10 @@ def updated(
         slope = belief.information @ (z - belief.mean) + trust * gradient
         step = -np.linalg.solve(belief.information + more, slope)
         for _ in range(HALVINGS):
-            trial = tried(z + step)
-            if trial is not None and trial[2] < cost:
+            trial = tried(z + step, cost)
+            if trial is not None:
                 break
-            step, trial = 0.5 * step, None
+            step = 0.5 * step
         if trial is None:
             break
         z, found, cost = trial
