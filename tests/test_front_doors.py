@@ -1,5 +1,6 @@
 """Logs with one wrong thing each: it is said, and no mass has to make up for it."""
 
+import json
 from csv import reader
 from dataclasses import replace
 from io import BytesIO
@@ -387,3 +388,46 @@ def test_a_row_for_each_joint_becomes_a_column_for_each(rows, is_long):
     for row in reader(rows):
         own = next(each for each in table if each[0] == row[0])
         assert own[names.index(f"{row[1]}/position")] == row[2]
+
+
+def test_columns_that_are_counted_are_of_the_order_that_the_efforts_go_with(tmp_path):
+    """Nine joints, whose file does not have them along the robot; names in each line of
+    JSON say it without that."""
+    links, n = [], 9
+    order = [0, 3, 6, 1, 4, 7, 2, 5, 8]  # Three limbs, joint by joint.
+    for k in order:
+        limb, place = divmod(k, 3)
+        parent = f"l{k - 1}" if place else "base"
+        links.append(
+            f'<link name="l{k}"><inertial><origin xyz="0 0 -0.1"/><mass value="{1 + k}"'
+            '/><inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/>'
+            f'</inertial></link><joint name="j{k}" type="revolute"><parent '
+            f'link="{parent}"/><child link="l{k}"/><origin xyz="0 {limb} -0.2"/><axis '
+            f'xyz="{place % 2} {1 - place % 2} 0"/><limit lower="-2" upper="2" '
+            'effort="90" velocity="9"/></joint>'
+        )
+    path = tmp_path / "limbs.urdf"
+    path.write_text(f'<robot name="limbs"><link name="base"/>{"".join(links)}</robot>')
+    robot = read_robot(path)
+    along = [joint.name.partition(".")[2] for joint in robot.joints]
+    assert along != [f"j{k}" for k in order]
+    t, w = np.arange(0.0, 12.0, 0.01), 1.0 + 0.2 * np.arange(n)
+    q = 0.6 * np.sin(t[:, None] * w + np.arange(n))
+    v, vd = w * 0.6 * np.cos(t[:, None] * w + np.arange(n)), -q * w**2
+    tau = needed_efforts(robot.plant, q, v, vd)
+    at = [along.index(f"j{k}") for k in order]
+    columns = {"time": t} | {f"q[{i}]": q[:, k] for i, k in enumerate(at)}
+    columns |= {f"tau[{i}]": tau[:, k] for i, k in enumerate(at)}
+    log = csv(tmp_path / "log.csv", columns)
+    proposal = propose_scene(robot, [read_log(log)])
+    assert "as the robot's file has its joints" in proposal.said[0].says
+    assert "'q[1]': limbs.j3.position" in proposal.sidecars[log]
+    lines = tmp_path / "log.jsonl"
+    text = [f"j{k}" for k in order]
+    lines.write_text("".join(
+        json.dumps({"t": s, "name": text, "q": list(x[at]), "tau": list(y[at])}) + "\n"
+        for s, x, y in zip(t, q, tau, strict=True)
+    ))  # fmt: skip
+    proposal = propose_scene(robot, [read_log(lines)])
+    assert proposal.said == ()
+    assert "q/j3: limbs.j3.position" in proposal.sidecars[lines]

@@ -576,8 +576,8 @@ def _rightly_read(contents: Contents, matches, said) -> list[Match]:
     mine = _columns_of(contents, matches, ("position",))
     turn = [i for i in mine if not contents.joints[i].prismatic]
     of = {m.column: m for m in matches}
-    far = float(np.ptp(contents.q[:, turn], axis=0).max(initial=0.0)) > FAR
-    sized = far or any(of[mine[i]].told.endswith(BY_SIZE) for i in turn)
+    sized = [i for i in turn if of[mine[i]].told.endswith(BY_SIZE)
+             or np.ptp(contents.q[:, i]) > FAR]  # fmt: skip
     few = contents.fewer(FEW)
     reading, now = few.reading, _all_told(few, efforts)
     while True:
@@ -631,7 +631,7 @@ def _geared_factors(told: Mapping[int, Told]) -> tuple[bool, bool]:
     return True, bool(np.ptp(np.log(factors)) > 2.0 * ALIKE)
 
 
-def _readings(few, reading: Reading, efforts, turn, of, mine, sized: bool):
+def _readings(few, reading: Reading, efforts, turn, of, mine, sized):
     """(another reading, whether it is of gears), each that is one step away."""
     own = [i for i in turn if of[mine[i]].why != AS_SAID]
     for i in (i for i in mine if of[mine[i]].why != AS_SAID):
@@ -725,15 +725,15 @@ def _as_read(contents: Contents, matches, mine, efforts, told, sized, said):
         which = ", ".join(mine[i] for i in own)
         says = f"By the efforts that go with them, {which} are {word}."
         said.append(Said("units", names[own[0]], float(scale[own[0]]), says))
-    off = max((x.left for x in told.values()), default=0.0)
-    if sized and not scaled and off > 1.0 - EXPLAINS:
-        which = ", ".join(mine[i] for i in mine if not contents.joints[i].prismatic)
+    off = [i for i in mine if i in told and told[i].left > 1.0 - EXPLAINS]
+    off = [i for i in off if i in sized]
+    if off and not scaled:
+        which = ", ".join(mine[i] for i in off)
         says = (
-            f"{which} are too large for rad, and by the efforts in no unit that is "
-            "known, nor on the motor's side of gears. Give each its scale in the "
-            "sidecar."
+            f"{which}: too large for rad, and by the efforts in no unit that is known, "
+            "nor on the motor's side of gears. Give each its scale in the sidecar."
         )
-        said.append(Said(UNITS_UNSURE, names[next(iter(mine))], 0.0, says))
+        said.append(Said(UNITS_UNSURE, names[off[0]], 0.0, says))
     out, number = [], {name: i for i, name in enumerate(names)}
     for m in matches:
         at, _, what = (m.channel or "").rpartition(".")
@@ -776,7 +776,7 @@ def _tared(contents: Contents, matches, said) -> list[Match]:
                 against += 1
         found.append((for_it - 4 * against, off))
     most_for, off = max(found, key=lambda x: x[0])
-    if not most_for > 0:
+    if 4 * most_for <= len(each) or most_for < min(len(each), 2):
         return matches
     which = ", ".join(efforts[i] for i in off)
     says = (
@@ -1018,7 +1018,7 @@ def _not_a_rotor(contents: Contents, name: str, i: int, factor: float) -> bool:
 def _in_words(factor: float, std: float) -> tuple[float, str]:
     """A factor, as round as it may be, and what it looks like."""
     size, sign = abs(factor), float(np.sign(factor))
-    other = "of the other sign than the model needs"
+    other = "of the other sign than the model needs (or its position and velocity are)"
     if GAINS[0] < size < GAINS[1]:
         return sign, other
     word = ""
@@ -1042,6 +1042,18 @@ def _round(x: float, within: float) -> float:
         if abs(y - x) <= within:
             return y
     return x
+
+
+def left_by(plant, joints, columns, matches: Sequence[Match]) -> float:
+    """Mean logarithm of the shares of what joints need that their efforts leave, as of
+    by_content; 0 where nothing tells."""
+    try:
+        contents = Contents(plant, joints, columns, matches).fewer(FEW)
+    except ValueError:
+        return 0.0
+    efforts = _columns_of(contents, matches, _DRIVES)
+    efforts = {i: name for i, name in efforts.items() if contents.moves(i)}
+    return _misfit(contents, efforts) if efforts else 0.0
 
 
 def told_by(contents: Contents, matches: Sequence[Match]) -> dict[str, Likeness]:

@@ -17,10 +17,13 @@ from makebreak.gap.data.arrays import is_time
 from makebreak.gap.data.bags import MotorRange, is_dataset, motor_ranges
 from makebreak.gap.data.base_pose import BasePose, base_pose
 from makebreak.gap.data.content import (
+    CLEARER,
+    EXPLAINS,
     WITHOUT_WEIGHT,
     Contents,
     Said,
     by_content,
+    left_by,
     told_by,
 )
 from makebreak.gap.data.findings import (
@@ -80,7 +83,8 @@ LEAST_LOAD = 0.05  # Of a joint's rms gravity torque [N m], to tell its servo by
 class Robot:
     """joints: in the order of the robot's coordinates. bases: bodies that nothing
     holds. plant: finalized, with the bases welded to the world, where a log says, pose,
-    or upright."""
+    or upright. numbered: joints in the order in which a log counts them, if that is
+    another."""
 
     path: Path
     model: str
@@ -90,6 +94,7 @@ class Robot:
     plant: MultibodyPlant
     file: RobotFile
     pose: BasePose | None = None
+    numbered: tuple[JointName, ...] = ()
 
 
 def read_robot(path: Path) -> Robot:
@@ -275,7 +280,7 @@ def read_log(
 
 
 def matches_of(log: Log, robot: Robot | None) -> list[Match]:
-    joints = robot.joints if robot is not None else ()
+    joints = () if robot is None else robot.numbered or robot.joints
     said = said_of(log.own.get("columns") or {})
     return propose(log.table.columns, joints, log.text, said, log.ranges)
 
@@ -377,6 +382,8 @@ class Judged:
 
 def judge_logs(robot: Robot, logs: Sequence[Log]) -> Judged:
     """Raises: ValueError for coupled joints that carry others."""
+    said: list[Said] = []
+    robot = _numbered(robot, logs, said)
     every = {log.path: matches_of(log, robot) for log in logs}
     pose = (
         base_pose([_unsaid(log) for log in logs], robot.bases) if robot.bases else None
@@ -388,7 +395,6 @@ def judge_logs(robot: Robot, logs: Sequence[Log]) -> Judged:
     unused = dict.fromkeys(m.column for matches in every.values() for m in matches
                            if m.why.endswith(UNKNOWN_JOINT))  # fmt: skip
     every = {path: _through_gears(robot, own) for path, own in every.items()}
-    said: list[Said] = []
     if pose is not None and not pose.is_still:
         says = (
             f"{robot.bases[0]}, the base, moves by {_moves(pose)} in the log, and the "
@@ -411,6 +417,41 @@ def judge_logs(robot: Robot, logs: Sequence[Log]) -> Judged:
         every[log.path] = of_one_drive(matches)
         said += [each for each in more if each not in said]
     return Judged(robot, every, fixed, tuple(unused), tuple(said))
+
+
+def _numbered(robot: Robot, logs: Sequence[Log], said: list[Said]) -> Robot:
+    """With joints counted as columns without names do, if the efforts say so: along the
+    robot (as MuJoCo, Drake and pinocchio count), as its file has them (as PyBullet), or
+    by names (as ROS)."""
+    at = {
+        f"{robot.model}.{j.name()}": int(j.index()) for j in one_dof_joints(robot.plant)
+    }
+    orders = {
+        "as the robot's file has its joints": sorted(
+            robot.joints, key=lambda joint: at[joint.name]
+        ),
+        "by its joints' names": sorted(robot.joints, key=lambda joint: joint.name),
+    }
+
+    def left(other: Robot) -> float:
+        each = [(log.table.columns, matches_of(log, other)) for log in logs]
+        return float(np.mean([left_by(robot.plant, robot.joints, *x) for x in each]))
+
+    first = [m.channel for m in matches_of(logs[0], robot)]
+    others = {
+        word: replace(robot, numbered=tuple(order)) for word, order in orders.items()
+    }
+    others = {word: other for word, other in others.items()
+              if [m.channel for m in matches_of(logs[0], other)] != first}  # fmt: skip
+    if not others:
+        return robot
+    each = {word: left(other) for word, other in others.items()}
+    word = min(each, key=lambda word: each[word])
+    if not each[word] < min(np.log(1.0 - EXPLAINS), left(robot) - np.log(CLEARER)):
+        return robot
+    says = f"By what is in them, columns without names are counted {word}."
+    said.append(Said("columns_mixed", robot.joints[0].name, len(robot.joints), says))
+    return others[word]
 
 
 def _maybe_of_a_range(logs: Sequence[Log], every) -> list[Said]:
