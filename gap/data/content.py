@@ -753,30 +753,26 @@ def _as_read(contents: Contents, matches, mine, efforts, told, sized, said):
 
 
 def _tared(contents: Contents, matches, said) -> list[Match]:
-    """With the offsets that were taken from efforts: all that carry weight are 0 where
-    the log begins, or on average, and the model's weight is not."""
+    """With the offsets that were taken from efforts: these are 0 where the log begins,
+    or on average, and what the joints need is not."""
     efforts = _columns_of(contents, matches, _DRIVES)
     of = {m.column: m for m in matches}
-    found = []
-    each = {i: (name, contents.told(name, i)) for i, name in efforts.items()}
-    each = {i: x for i, x in each.items() if x[1].left < 1.0 - EXPLAINS}
-    if 2 * len(each) <= len(efforts):
+    raw = {i: contents.raw(name) for i, name in efforts.items() if contents.moves(i)}
+    raw = {i: y for i, y in raw.items() if len(y)}
+    first = [min(abs(y[0]), abs(np.mean(y[:5]))) for y in raw.values()]
+    sizes = [WEIGHS * np.std(y) for y in raw.values()]
+    starts = np.less(first, sizes)
+    means = np.less([abs(np.mean(y)) / WEIGHS for y in raw.values()], sizes)
+    if max(starts.sum(), means.sum()) < 0.8 * max(len(raw), 1):
         return matches
-    for part in (slice(0, 1), slice(None)):
-        off, for_it, against = {}, 0, 0
-        for i, (name, told) in each.items():
-            m, needed = of[name], contents.needed[:, i]
-            zero = abs(told.factor * np.mean(contents.raw(name)[part]))
-            bias = told.bias - told.factor * m.offset / m.scale
-            most = WEIGHS * np.sqrt(np.mean(needed**2))
-            off[i] = bias
-            if abs(bias) > most and zero < 2.0 * WEIGHS * abs(bias):
-                for_it += 1
-            elif abs(np.mean(needed[part])) > 2.0 * most:
-                against += 1
-        found.append((for_it - 4 * against, off))
-    most_for, off = max(found, key=lambda x: x[0])
-    if 4 * most_for <= len(each) or most_for < min(len(each), 2):
+    off, most = {}, 0.0
+    for i in raw:
+        m, told = of[efforts[i]], contents.told(efforts[i], i)
+        if told.left < 1.0 - EXPLAINS:
+            off[i] = told.bias - told.factor * m.offset / m.scale
+            size = np.sqrt(np.mean(contents.needed[:, i] ** 2))
+            most = max(most, abs(off[i]) / max(size, 1e-300))
+    if most < WEIGHS or 2 * len(off) < len(raw):
         return matches
     which = ", ".join(efforts[i] for i in off)
     says = (
