@@ -1,7 +1,8 @@
 """`makebreak bench parameter_learner`: what it is worth to learn masses and friction.
 
 Four plants whose planner's model is wrong: the error of the task without the learner,
-with it, and with the right model; how far the learned values are off, and how often
+with it, with it and a goal that is approached with care (CarefulGoal), and with the
+right model; how far the learned values are off, and how often
 their 90 % intervals hold the truth. The world is Drake at 1 ms steps.
 
     door    a two-link arm pushes a door on a damped hinge to an angle, and lets it go
@@ -22,6 +23,7 @@ from pydrake.systems.framework import DiagramBuilder
 from makebreak.benchmarks import plants as p
 from makebreak.diagrams.contact_mpc import ContactMpcConfig, make_contact_mpc
 from makebreak.models.effects.joint_forces import JointForces
+from makebreak.systems.contact_mpc.careful_goal import CarefulGoalConfig
 from makebreak.systems.contact_mpc.lcs_builder import ContactPair
 from makebreak.systems.contact_mpc.multibody.model_parameters import (
     POSITIVE,
@@ -35,8 +37,13 @@ from makebreak.systems.contact_mpc.parameter_learner import (
 from makebreak.systems.numerics.joint_laws import coulomb_law
 
 FACTORS = (0.5, 2.0)  # Between which the truth is that of the model.
+# Whether the planner knows, learns, and is careful: the columns of a row.
+WAYS = (
+    (False, False, False), (False, True, False), (False, True, True),
+    (True, False, False),
+)  # fmt: skip
 NINETY = 1.645  # Deviations of a 90 % interval.
-FIRST_SEED = 9000
+FIRST_SEED = 9200
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +55,7 @@ class Task:
         values: the model's. learned: the parameter of each.
         q: positions at the start; x_desired, Q, R, N, dt, u_max: of the planner.
         goal: index of the position whose final error counts, in `unit`s of 1e-3.
+        careful: indices of the positions that are approached with care; empty: none.
     """
 
     name: str
@@ -65,6 +73,7 @@ class Task:
     dt: float = 0.05
     u_max: float = np.inf
     seconds: float = 4.0
+    careful: Sequence[int] = ()
     dry: str = ""  # Joint that has the value `coulomb` as its dry friction.
 
 
@@ -115,7 +124,7 @@ DOOR = Task(
         "gap": Parameter("gap", 0.003, pairs=[0]),
     },
     [1.0, -2.0, 0.0], [0.4, -0.2, -0.5, 0.0, 0.0, 0.0],
-    [0.0, 0.0, 300.0, 5.0, 5.0, 10.0], [0.02] * 2, 2, "mrad", N=20,
+    [0.0, 0.0, 300.0, 5.0, 5.0, 10.0], [0.02] * 2, 2, "mrad", N=20, careful=[2],
 )  # fmt: skip
 
 
@@ -137,7 +146,7 @@ DRAWER = Task(
         "gap": Parameter("gap", 0.003, pairs=[0]),
     },
     [0.0, 0.0], [0.3, 0.3, 0.0, 0.0], [0.0, 300.0, 1.0, 5.0], [0.01], 1, "mm", N=15,
-    dry="drawer_joint",
+    careful=[1], dry="drawer_joint",
 )  # fmt: skip
 
 
@@ -197,7 +206,7 @@ BOX = Task(
     [-0.07, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0251],
     [0.14, 0.0, 1.0, 0.0, 0.0, 0.0, 0.2, 0.0, 0.0251, *[0.0] * 8],
     [0.0, 0.0, *[0.0] * 4, 500.0, 500.0, 0.0, 1.0, 1.0, *[0.0] * 3, 5.0, 5.0, 0.0],
-    [0.01] * 2, 6, "mm", N=10,
+    [0.01] * 2, 6, "mm", N=10, careful=[6, 7],
 )  # fmt: skip
 TASKS = {task.name: task for task in (DOOR, DRAWER, LEG, BOX)}
 
@@ -212,8 +221,9 @@ class Run:
     off: np.ndarray | None = None
 
 
-def run(task: Task, true: dict, knows: bool, learns: bool) -> Run:
-    """Args: true: the world's values; knows: whether the planner's model has them."""
+def run(task: Task, true: dict, knows: bool, learns: bool, careful=False) -> Run:
+    """Args: true: the world's values; knows: whether the planner's model has them;
+    careful: whether the learner's task.careful are approached with care."""
     own = true if knows else task.values
     model_items = {
         name: replace(item, model=own[name]) if item.model else item
@@ -231,6 +241,7 @@ def run(task: Task, true: dict, knows: bool, learns: bool) -> Run:
         pairs, list(task.Q), list(task.R), list(task.x_desired), task.dt, task.dt,
         C3Options(N=task.N, rounds=5, polish=3), C3Bounds(-limit, limit),
         parameters=items,
+        careful=CarefulGoalConfig(list(task.careful) if careful else []),
     )  # fmt: skip
     mpc = builder.AddSystem(make_contact_mpc(model, config))
     state = plant.get_state_output_port()
@@ -250,6 +261,10 @@ def run(task: Task, true: dict, knows: bool, learns: bool) -> Run:
         builder.Connect(
             learner.GetOutputPort("parameters"), mpc.GetInputPort("parameters")
         )
+        if config.careful.positions:
+            builder.Connect(
+                learner.GetOutputPort("unknown"), mpc.GetInputPort("unknown")
+            )
     simulator = Simulator(builder.Build())
     context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     plant.SetPositions(context, task.q)
@@ -298,19 +313,17 @@ def row(task: Task, seeds: Sequence[int]) -> dict:
     offs, errors = [], []
     for seed in seeds:
         true = drawn(task, seed)
-        without, learned, right = (
-            run(task, true, knows, learns)
-            for knows, learns in ((False, False), (False, True), (True, False))
-        )
-        errors.append([without.error, learned.error, right.error])
+        without, learned, careful, right = (run(task, true, *how) for how in WAYS)
+        errors.append([without.error, learned.error, careful.error, right.error])
         offs.append(learned.off)
     off = np.abs(np.array(offs, dtype=float))
-    without, learned, right = np.median(errors, axis=0)
+    without, learned, careful, right = np.median(errors, axis=0)
     return {
         "what": f"{task.name}, {len(seeds)} wrong models: error with the learner",
         "value": float(learned),
         "unit": task.unit,
         "without": float(without),
+        "careful": float(careful),
         "right_model": float(right),
         "worst": [round(float(e), 1) for e in np.max(errors, axis=0)],
         "within_90": float(np.mean(off < NINETY)),

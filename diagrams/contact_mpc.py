@@ -10,6 +10,7 @@ from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
 from makebreak.systems.contact_mpc.c3_mpc import C3Config, C3Mpc
+from makebreak.systems.contact_mpc.careful_goal import CarefulGoal, CarefulGoalConfig
 from makebreak.systems.contact_mpc.lcs_builder import (
     AnitescuLcsBuilder,
     ContactPair,
@@ -50,6 +51,9 @@ class ContactMpcConfig:
     lcs_along_plan: bool = False
     # Those that a ParameterLearner learns; the plan is for its values of them.
     parameters: list[Parameter] = field(default_factory=list)
+    # Positions whose x_desired is approached with care while the parameters are not
+    # known: of what is pushed and coasts.
+    careful: CarefulGoalConfig = field(default_factory=CarefulGoalConfig)
     weights: KnotWeights = field(default_factory=KnotWeights)
 
 
@@ -112,9 +116,10 @@ def make_contact_mpc(model: Diagram, config: ContactMpcConfig) -> Diagram:
 
     Inputs:  x (n_x,), the state [q, v] of the model's plant; r_comp (n_lam,),
              optional, of a ResidualLearner whose period is dt_sec; parameters (n,),
-             with config.parameters only, of a ParameterLearner; x_desired
-             ((N + 1) n_x,), without config.x_desired only: where the state is to be at
-             each knot, dt_sec apart, row by row.
+             with config.parameters only, and unknown (1,), with careful.positions
+             only, of a ParameterLearner; x_desired ((N + 1) n_x,), without
+             config.x_desired only: where the state is to be at each knot, dt_sec
+             apart, row by row.
     Outputs: u (n_u,) [N, N m]; status (1,), a C3Status; plan, a Plan (abstract); lcs,
              what the plan is for (abstract; a tuple with lcs_along_plan), about the x
              of each multiple of period_sec.
@@ -176,7 +181,16 @@ def make_contact_mpc(model: Diagram, config: ContactMpcConfig) -> Diagram:
             offset_sec=1e-4,  # After the builder, so that the LCS is about this state.
         ),
     )
-    if c.x_desired:
+    careful = None
+    if c.careful.positions:
+        if not c.x_desired:
+            raise ValueError("ContactMpcConfig.careful came without x_desired")
+        careful = builder.AddNamedSystem(
+            "careful_goal", CarefulGoal(c.careful, c.x_desired, c.options.N + 1)
+        )
+        builder.Connect(careful.get_output_port(), c3.GetInputPort("x_desired"))
+        builder.ExportInput(careful.GetInputPort("unknown"), "unknown")
+    elif c.x_desired:
         goal = builder.AddSystem(
             ConstantVectorSource(np.tile(c.x_desired, c.options.N + 1))
         )
@@ -190,6 +204,8 @@ def make_contact_mpc(model: Diagram, config: ContactMpcConfig) -> Diagram:
         builder.Connect(c3.GetOutputPort("plan"), lcs.GetInputPort("plan"))
     builder.ExportInput(lcs.GetInputPort("x"), "x")
     builder.ConnectInput("x", c3.GetInputPort("x"))
+    if careful is not None:
+        builder.ConnectInput("x", careful.GetInputPort("x"))
     builder.ExportInput(c3.GetInputPort("r_comp"), "r_comp")
     if c.parameters:
         builder.ExportInput(lcs.GetInputPort("parameters"), "parameters")

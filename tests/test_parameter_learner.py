@@ -12,6 +12,7 @@ from makebreak.benchmarks import parameter_learner as bench
 from makebreak.benchmarks.plants import diagram_of
 from makebreak.diagrams.push_object_config import contact_pairs
 from makebreak.models.pushed_object import PushedObject, make_tip_and_object
+from makebreak.systems.contact_mpc.careful_goal import CarefulGoal, CarefulGoalConfig
 from makebreak.systems.contact_mpc.lcs_builder import (
     AnitescuLcs,
     AnitescuLcsBuilder,
@@ -648,3 +649,47 @@ def test_the_builder_plans_with_the_values_that_it_gets():
     expected = model_of(LEG).build(X, np.zeros(2), parameters=values)
     np.testing.assert_allclose(got.D, expected.D)
     np.testing.assert_allclose(got.c, expected.c)
+
+
+# A goal that is approached with care.
+
+
+def test_a_goal_is_as_near_as_what_is_unknown_asks():
+    system = CarefulGoal(CarefulGoalConfig([1], 2.0), [1.0, 4.0, 0.5], n_knots=2)
+    context = system.CreateDefaultContext()
+    system.GetInputPort("x").FixValue(context, [0.0, 2.0, 0.0])
+    for unknown, place in ((0.0, 4.0), (0.5 * np.log(2.0), 3.0), (50.0, 2.0)):
+        system.GetInputPort("unknown").FixValue(context, [unknown])
+        x_desired = system.get_output_port().Eval(context)
+        np.testing.assert_allclose(x_desired, 2 * [1.0, place, 0.5], atol=1e-12)
+    for wrong, said in (
+        (CarefulGoalConfig([3]), "positions has 3, expected 0 to 2"),
+        (CarefulGoalConfig([0], -1.0), "deviations is -1.0, expected >= 0"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            CarefulGoal(wrong, [1.0, 4.0, 0.5], n_knots=2)
+
+
+def test_what_is_unknown_is_of_masses_damping_and_friction():
+    """Of the leg at first: two deviations of 0.5 of logarithms, and a gap's."""
+    _, learner = learner_beside(X, [0.0, 0.0])
+    unknown = learner.GetOutputPort("unknown").Eval(learner.CreateDefaultContext())
+    assert unknown == pytest.approx([np.hypot(0.5, 0.5)])
+
+
+@pytest.mark.parametrize(
+    ("task", "true"),
+    [
+        (BOX, {"mass": 0.2, "friction": 0.2}),
+        pytest.param(DOOR, {"damping": 0.4}, marks=pytest.mark.slow),
+        pytest.param(DRAWER, {"coulomb": 1.0}, marks=pytest.mark.slow),
+    ],
+    ids=lambda t: getattr(t, "name", str(t)),
+)
+def test_what_is_lighter_than_the_model_is_not_pushed_past_its_goal(task, true):
+    """It comes to a tenth of where one hard push leaves it (drawer: to a quarter)."""
+    world = task.values | true
+    hard = bench.run(task, world, knows=False, learns=True)
+    careful = bench.run(task, world, knows=False, learns=True, careful=True)
+    assert hard.error > 40.0
+    assert careful.error < (0.25 if task is DRAWER else 0.1) * hard.error

@@ -107,8 +107,9 @@ class ParameterLearner(LeafSystem):
     Outputs: parameters (n,): values to plan with, each as far from the model's as it is
              certain; estimate (n,): the most probable values; std (n,): of z, so of the
              logarithm times the parameter's std for masses, damping and friction, else
-             in units of it; loss (1,): of the newest step; status (1,): a
-             ParameterStatus.
+             in units of it; unknown (1,): deviation of the logarithm of all masses,
+             damping and friction together, for CarefulGoal; loss (1,): of the newest
+             step; status (1,): a ParameterStatus.
 
     The learner builds its own LCS about each measured state, with dt = period_sec, so
     its rate does not depend on the planner's.
@@ -188,6 +189,8 @@ class ParameterLearner(LeafSystem):
         output("parameters", n, to_plan_with)
         output("estimate", n, lambda m: values(m.belief.mean))
         output("std", n, lambda m: m.belief.std)
+        spread = np.where(self._scale.is_log, self._scale.std, 0.0)
+        output("unknown", 1, lambda m: np.linalg.norm(spread * m.belief.std))
         output("loss", 1, lambda m: m.loss)
         output("status", 1, lambda m: float(m.status))
         self.DeclarePeriodicUnrestrictedUpdateEvent(
