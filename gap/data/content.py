@@ -424,10 +424,10 @@ def _rightly_ordered(contents: Contents, matches, said) -> list[Match]:
     efforts = _columns_of(contents, matches, _DRIVES)
     order = _order(speeds, contents.of_velocity, n)
     if order is not None:
-        before = _fit(contents, efforts)
+        before = _misfit(contents, efforts) if efforts else 0.0
         moved = [int(k) for k in np.argsort(order)]
         contents.read(replace(contents.reading, order=tuple(moved)))
-        if _fit(contents, efforts) > before + 0.2:
+        if efforts and _misfit(contents, efforts) < before - np.log(CLEARER):
             return _reordered(contents, matches, ("position",), moved, said)
         contents.read(Reading.as_is(n))
         matches = _reordered(contents, matches, ("velocity",), order, said)
@@ -449,18 +449,16 @@ def _columns_of(contents: Contents, matches, quantities) -> dict[int, str]:
     return found
 
 
-def _fit(contents: Contents, efforts: Mapping[int, str]) -> float:
-    each = [contents.of_effort(name, i) for i, name in efforts.items()]
-    return float(np.mean([0.0 if x is None else x.explained for x in each] or [0.0]))
-
-
 def _order(columns: Mapping[int, str], relation, n: int) -> list[int] | None:
     """(n,) whose column fits each joint; None where the names are right, or it is not
     clear that they are wrong."""
     if len(columns) < 2:
         return None
     left = _left(columns, relation, n)
-    order, _ = _assigned(left, columns)
+    there, order = list(columns), list(range(n))
+    cost = np.log(np.maximum(left, 1e-3))[np.ix_(there, there)]
+    for i, k in zip(*linear_sum_assignment(cost), strict=True):
+        order[there[i]] = there[k]
     wrong = [i for i in range(n) if order[i] != i]
     clear = all(
         left[i, order[i]] < 1.0 - EXPLAINS and left[i, i] > CLEARER * left[i, order[i]]
@@ -477,18 +475,6 @@ def _left(columns: Mapping[int, str], relation, n: int) -> np.ndarray:
             found = relation(name, i)
             left[i, k] = 1.0 if found is None else 1.0 - found.explained
     return left
-
-
-def _assigned(left: np.ndarray, columns: Mapping[int, str]) -> tuple[list[int], float]:
-    """(n,) whose column fits each joint best; the mean logarithm of what is left."""
-    there, order = list(columns), list(range(len(left)))
-    if not there:
-        return order, 0.0
-    cost = np.log(np.maximum(left, 1e-3))[np.ix_(there, there)]
-    rows, cols = linear_sum_assignment(cost)
-    for i, k in zip(rows, cols, strict=True):
-        order[there[i]] = there[k]
-    return order, float(cost[rows, cols].mean())
 
 
 def _reordered(contents, matches, quantities, order: Sequence[int], said):
