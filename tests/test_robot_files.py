@@ -454,3 +454,30 @@ def test_public_urdfs_are_accepted_or_refused_for_their_defect(tmp_path):
     for name, message in refused.items():
         assert re.search(said[name], message)
     assert len(files) - len(refused) == 60
+
+
+@pytest.mark.parametrize("radius, overlap", [(0.5, True), (0.1, False)])
+def test_shapes_that_lie_in_each_other_in_a_log_do_not_push(tmp_path, radius, overlap):
+    """A ball around the end, and one at the base: only the log tells that they meet."""
+    ball = (
+        '<collision name="ball"><origin xyz="0 0 {z}"/><geometry>'
+        f'<sphere radius="{radius}"/></geometry></collision>'
+    )
+    path = robot(
+        tmp_path, link("l0", more=ball.format(z=0)), link("l1"),
+        link("l2", more=ball.format(z=0)), joint("j0", "base", "l0", "fixed"),
+        joint("j1", "l0", "l1"), joint("j2", "l1", "l2"),
+    )  # fmt: skip
+    proposal = proposal_of(tmp_path, path)
+    (tmp_path / "scene.yaml").write_text(proposal.scene)
+    builder = DiagramBuilder()
+    plant = load_scene(tmp_path / "scene.yaml", builder).plant
+    diagram = builder.Build()
+    context = plant.GetMyContextFromRoot(diagram.CreateDefaultContext())
+    plant.SetPositions(context, [0.0, 0.0])
+    query = plant.get_geometry_query_input_port().Eval(context)
+    assert query.ComputePointPairPenetration() == []
+    said = [each.says for each in proposal.said if each.kind == "parts_overlap"]
+    assert bool(said) == overlap
+    if overlap:
+        assert "arm::l0 and arm::l2 lie in each other" in said[0]

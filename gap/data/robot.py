@@ -36,6 +36,7 @@ from makebreak.gap.data.findings import (
 )
 from makebreak.gap.data.joined import read_joined
 from makebreak.gap.data.match import AS_SAID, JointName, Match
+from makebreak.gap.data.own_contacts import overlapping
 from makebreak.gap.data.proposal import (
     CURRENT,
     UNKNOWN_JOINT,
@@ -550,6 +551,26 @@ def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
     own = "" if gravity == [0.0, 0.0, -9.81] else f", gravity: {gravity}"
     lines += [f"plant: {{time_step: 0.001{own}}}", *actuation]
     lines += _effects_of_file(robot, fixed, lines)
+    said = judged.said
+    apart = overlapping("\n".join(lines) + "\n", copies, [
+        {name.rpartition(".")[0]: y for name, y in _scaled(log, every[log.path]).items()
+         if name.endswith(".position")}
+        for log in logs
+    ])  # fmt: skip
+    if apart:
+        groups = [
+            f"- add_collision_filter_group: {{name: overlap_{k}, members: [{a}, {b}], "
+            f"ignored_collision_filter_groups: [overlap_{k}]}}"
+            for k, (a, b) in enumerate(apart)
+        ]
+        k = next(k for k, line in enumerate(lines) if line.startswith("plant:"))
+        lines[k:k] = groups
+        says = (
+            f"{', '.join(f'{a} and {b}' for a, b in apart)} lie in each other in poses "
+            "of the log: their collision shapes are larger than the parts. They pass "
+            "through each other in the proposed scene (add_collision_filter_group)."
+        )
+        said += (Said("parts_overlap", robot.model, len(apart), says),)
     notes += [says for log in logs for says in log.sidecar.notes]
     notes += [f"{robot.path.name}: {note}" for note in robot.file.notes]
     sidecars = {
@@ -572,7 +593,7 @@ def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
         stem_of(logs[0].path),
         copies,
         robot.file.notes,
-        judged.said,
+        said,
     )
 
 
