@@ -467,8 +467,10 @@ def test_shapes_that_lie_in_each_other_in_a_log_do_not_push(tmp_path, radius, ov
         tmp_path, link("l0", more=ball.format(z=0)), link("l1"),
         link("l2", more=ball.format(z=0)), joint("j0", "base", "l0", "fixed"),
         joint("j1", "l0", "l1"), joint("j2", "l1", "l2"),
+        link("l3"), joint("j3", "l2", "l3"),
     )  # fmt: skip
     proposal = proposal_of(tmp_path, path)
+    assert "fixed_joints: {arm.j3: 0}" in proposal.scene
     (tmp_path / "scene.yaml").write_text(proposal.scene)
     builder = DiagramBuilder()
     plant = load_scene(tmp_path / "scene.yaml", builder).plant

@@ -970,7 +970,8 @@ def _rated(joint: JointName, factor: float) -> tuple[float, str] | None:
     """The part of a joint's effort limit that a factor is, if it is one that drives
     count in."""
     for part, word in ((1e-2, "per cent"), (1e-3, "per mille")):
-        if abs(abs(factor) / (part * joint.effort) - 1.0) < ALIKE:
+        off = abs(abs(factor) / (part * joint.effort) - 1.0)
+        if off < ALIKE and all(abs(abs(factor) / x - 1.0) > off for x, _ in _UNITS):
             return part, f"as if in {word} of each joint's effort limit"
     return None
 

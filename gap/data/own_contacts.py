@@ -14,7 +14,7 @@ from pydrake.systems.framework import DiagramBuilder
 from makebreak.models.effects.kind import full_name, one_dof_joints
 from makebreak.models.scene import load_scene
 
-POSES = 30  # Of a log, that are looked at.
+POSES = 300  # Of a log, that are looked at.
 TOUCHES = 1e-3  # [m] Parts that press on each other are no deeper.
 
 

@@ -559,12 +559,12 @@ def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
     ])  # fmt: skip
     if apart:
         groups = [
-            f"- add_collision_filter_group: {{name: overlap_{k}, members: [{a}, {b}], "
-            f"ignored_collision_filter_groups: [overlap_{k}]}}"
-            for k, (a, b) in enumerate(apart)
+            f"- add_collision_filter_group: {{name: overlap_{k}, members: "
+            f"{json.dumps(pair)}, ignored_collision_filter_groups: [overlap_{k}]}}"
+            for k, pair in enumerate(apart)
         ]
-        k = next(k for k, line in enumerate(lines) if line.startswith("plant:"))
-        lines[k:k] = groups
+        last = max(k for k, line in enumerate(lines) if line.startswith("- add_"))
+        lines[last + 1 : last + 1] = groups
         says = (
             f"{', '.join(f'{a} and {b}' for a, b in apart)} lie in each other in poses "
             "of the log: their collision shapes are larger than the parts. They pass "
