@@ -237,7 +237,7 @@ class _Free:
             if name not in fixed[i] and not KINDS[effect.kind].parameter(name).given
         ]
         self.scale = np.array([size_of(start[i], name) for i, name in self.names])
-        least = [problem.dynamics.least(e.kind, e.at) for e in start]
+        least = [problem.least(e.kind, e.at) for e in start]
         self.low = np.array(
             [
                 max(_lowest(start[i].kind, name), least[i].get(name, -np.inf))

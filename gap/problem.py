@@ -248,6 +248,10 @@ class GapProblem(ABC):
     @abstractmethod
     def nuisances(self) -> Nuisances: ...
 
+    def least(self, kind: str, at: Sequence[str]) -> dict[str, float]:
+        """Lower bounds of parameters: what the model allows, and what the data do."""
+        return self.dynamics.least(kind, at)
+
     def prior_rows(self, effects: Sequence[Effect]) -> np.ndarray:
         """(n,) what is known of parameters beforehand, in deviations: of those that
         data may leave open."""

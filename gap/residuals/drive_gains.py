@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from makebreak.models.drives import law_of
-from makebreak.models.effects.drive_gains import more_damping, other_kp
+from makebreak.models.effects.drive_gains import more_damping, other_gain, other_kp
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import Scene
 
@@ -71,11 +71,15 @@ def gain_columns(model) -> tuple[list[np.ndarray], list[float], list[str]]:
             efforts = []
             for track, motion in zip(model.tracks, model.motions(), strict=True):
                 less = np.zeros((*motion.v.shape, 1))
-                if "kp" in effect.parameters:
-                    stiffer = model.motion(track, [effect]).effort
-                    less[:, i, 0] = (motion.effort - stiffer)[:, i] / size
-                else:
+                if "damping" in effect.parameters:
                     less[:, i, 0] = effect.parameters["damping"] / size * motion.v[:, i]
+                    told = track.commands.get(f"{joint}.velocity_command")
+                    if told is not None:
+                        kd = float(law_of(model.scene.actuation, joint).kd)
+                        less[:, i, 0] -= kd * track.mean_held(told, 0.0)
+                else:
+                    other = model.motion(track, [effect]).effort
+                    less[:, i, 0] = (motion.effort - other)[:, i] / size
                 efforts.append(less)
             columns.append(model.columns_of(efforts)[:, 0])
             prior.append(share)
@@ -95,8 +99,10 @@ def _changes(
     law = law_of(scene.actuation, joint)
     if law is None:
         return
-    if law.kp > 0.0:
-        stiffer = other_kp(joint, float(law.kp) * (1.0 + more))
-        yield gain_name(joint, "kp"), stiffer, more
+    if not law.kp > 0.0:  # It follows velocities: all that it gives is by its damping.
+        yield gain_name(joint, "kd"), other_gain(joint, 1.0 + more), more
+        return
+    stiffer = other_kp(joint, float(law.kp) * (1.0 + more))
+    yield gain_name(joint, "kp"), stiffer, more
     if (damping := float(law.kd + law.emf)) > 0.0:
         yield gain_name(joint, "kd"), more_damping(joint, more * damping), more

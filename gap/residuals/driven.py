@@ -576,7 +576,7 @@ class DrivenProblem(DrivenWindows, GapProblem):
                     ]
                 found.append(
                     Candidate(kind, (joint,), 1, tuple(own), tuple(readers),
-                              least=self.dynamics.least(kind, [joint]))
+                              least=self.least(kind, [joint]))
                 )  # fmt: skip
             if KINDS[kind].path == "delay" and each:
                 _, step = next(iter(each.values()))

@@ -570,7 +570,7 @@ class ImpactProblem(ImpactWindows, WindowedProblem):
                 columns.append(((current.r - moved) / step)[:, None])
                 readers.append(reader_of_trial(kind, (name,), trial))
             if columns:
-                least = self.dynamics.least(kind, [at])
+                least = self.least(kind, [at])
                 found.append(
                     Candidate(
                         kind, (at,), 1, tuple(columns), tuple(readers), least=least

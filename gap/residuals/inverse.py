@@ -342,6 +342,23 @@ class InverseModel(WhitenedRows):
             names.append(f"input_delay of {self.joints[i]}, loop")
         return columns, [LOOP_SEC] * len(columns), names
 
+    def least(self, kind: str, at: Sequence[str]) -> dict[str, float]:
+        """Lower bounds of parameters: what the model allows; and a drive that follows
+        positions gives what its law asks for most of the time that its joint moves.
+        (With next to no limit, light links need nothing and are given nothing.)"""
+        found = self.dynamics.least(kind, at)
+        for i, joint in enumerate(self.joints):
+            bounded = KINDS[kind].path == "saturation" and joint in at
+            if not bounded or self.laws[i] is None:
+                continue
+            asked = np.concatenate([
+                np.abs(m.effort[:, i])[np.abs(m.v[:, i]) > self._rest[i]]
+                for m in self.motions()
+            ])  # fmt: skip
+            if len(asked):
+                found["limit"] = max(found.get("limit", 0.0), float(np.median(asked)))
+        return found
+
 
 def _adds_up(heavy: Sequence[Effect]) -> bool:
     """Whether what weights and gravity change is the sum of what each does: gravity

@@ -162,11 +162,13 @@ class MechanismProblem(InverseModel, GapProblem):
                     least = _surprise(u, free + held) - REST_EVIDENCE
                     continue
                 size = float(rms(u[rests] / share[rests]))
-                if size**2 < np.median(free):
-                    continue
-                cost = _surprise(u, free + (share * size) ** 2)
+                cost, none = (
+                    _surprise(u, free + (share * held) ** 2) for held in (size, 0.0)
+                )
+                if none - REST_EVIDENCE < cost:
+                    size, cost = 0.0, none  # Nothing holds it.
                 # At first the fastest, as a fit to all bends to rows of joints at rest.
-                if cost < least or (at_first and not np.isnan(most[i])):
+                if cost < least or (at_first and size and not np.isnan(most[i])):
                     least, speeds[i], most[i] = min(cost, least), speed, size
         return speeds, most
 

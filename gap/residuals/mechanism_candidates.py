@@ -142,7 +142,7 @@ def candidates(
             found.append(
                 Candidate(
                     kind, (at,), size, tuple(columns), tuple(readers),
-                    least=dynamics.least(kind, [at]),
+                    least=model.least(kind, [at]),
                 )
             )  # fmt: skip
         if is_wave:

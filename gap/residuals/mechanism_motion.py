@@ -23,7 +23,7 @@ from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
 from makebreak.models.effects.measured_channels import is_link_side
-from makebreak.models.effects.signature import Motion
+from makebreak.models.effects.signature import Motion, filtered
 from makebreak.models.scene import Scene
 from makebreak.systems.numerics.filters import mean_delay, with_lag
 
@@ -251,9 +251,6 @@ class MechanismMotion:
 
 def _mean_lagged(step: np.ndarray, u: np.ndarray, lag: float) -> np.ndarray:
     """(n,) means of y' = (u - y)/lag over the intervals, u held in each."""
-    keep = np.exp(-step / lag)
-    y = np.empty(len(u) + 1)
-    y[0] = u[0]
-    for k in range(len(u)):
-        y[k + 1] = keep[k] * y[k] + (1.0 - keep[k]) * u[k]
+    ends = np.concatenate([[0.0], np.cumsum(step)])
+    y = filtered(ends, np.append(u, u[-1]), lag)
     return u - lag * np.diff(y) / step

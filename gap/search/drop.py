@@ -219,7 +219,7 @@ def _is_certain(
     farther off than those."""
     choice, alone = chosen[k], len(chosen) == 1
     kind, at = choice.effect.kind, choice.effect.at
-    least = search.problem.dynamics.least(kind, at)
+    least = search.problem.least(kind, at)
     if not is_significant(choice, alone) or not is_sane(choice.effect, least):
         return False
     endless = any(each.endless for each in KINDS[kind].parameters)

@@ -97,7 +97,7 @@ class Rivals:
         value, or of a body without mass. nothing: the two as they are in the scene."""
         two = zip(both.effects[-2:], both.std[-2:], nothing, strict=True)
         for effect, std, now in two:
-            least = self._search.problem.dynamics.least(effect.kind, effect.at)
+            least = self._search.problem.least(effect.kind, effect.at)
             for name, value in effect.parameters.items():
                 far = std.get(name, 0.0)
                 if value + far >= highest(effect.kind, name):

@@ -8,6 +8,11 @@ def other_kp(joint: str, kp: float) -> Effect:
     return Effect("servo_gain", [joint], {"kp": kp})
 
 
+def other_gain(joint: str, gain: float) -> Effect:
+    """A drive that gives so many times what it should."""
+    return Effect("actuator_gain", [joint], {"gain": gain})
+
+
 def more_damping(joint: str, damping: float) -> Effect:
     """A drive that damps by so much more [N m s/rad, N s/m]."""
     return Effect("joint_viscous_damping", [joint], {"damping": damping})

@@ -19,6 +19,7 @@ from typing import Any, Protocol
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import RigidBody
+from scipy.linalg import solve_banded
 
 from makebreak.models.effects.kind import Effect, EffectKind
 
@@ -187,9 +188,10 @@ def lagged(time: np.ndarray, u: np.ndarray, delay: float) -> np.ndarray:
 
 
 def filtered(time: np.ndarray, u: np.ndarray, time_constant: float) -> np.ndarray:
-    """u (n, ...) after a first-order lag, with values held between samples."""
+    """u (n,) or (n, k) after a first-order lag, with values held between samples."""
     keep = np.exp(-np.diff(time) / time_constant)
-    out = np.array(u, dtype=float)
-    for i, a in enumerate(keep):
-        out[i + 1] = a * out[i] + (1.0 - a) * u[i]
-    return out
+    u = np.asarray(u, dtype=float)
+    given = (u[:-1].T * (1.0 - keep)).T
+    # out[i + 1] - keep[i] out[i] = (1 - keep[i]) u[i]: a matrix of two diagonals.
+    two = np.stack([np.ones(len(u)), np.append(-keep, 0.0)])
+    return solve_banded((1, 0), two, np.concatenate([u[:1], given]))
