@@ -17,7 +17,7 @@ from makebreak.gap.result import AGREES, GapMeasure, GapResult, InUnits, NamedEf
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import full_name, one_dof_joints, sentence
-from makebreak.models.scene import Scene
+from makebreak.models.scene import ActuationSection, Scene
 
 SAME_Z = 3.0  # Deviations of both, within which one value is that of all limbs.
 
@@ -64,7 +64,7 @@ def only(joints: Sequence[str], scene: Scene, parts: Split) -> tuple[Scene, Spli
             effects.append(replace(effect, at=at))
     scene = replace(
         scene,
-        actuation=replace(
+        actuation=ActuationSection() if not kept else replace(
             act, joints=[act.joints[k] for k in kept], supply=supply,
             kp=some(act.kp), kd=some(act.kd), limit=some(act.limit),
             dead_band=some(act.dead_band), resolution=some(act.resolution),

@@ -11,6 +11,7 @@ from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.residuals.drive_gains import gain_columns, with_moved_gains
 from makebreak.gap.residuals.driven import DrivenProblem
 from makebreak.gap.residuals.inverse import InverseModel
+from makebreak.gap.residuals.mechanism import MechanismProblem
 from makebreak.gap.simulation.commands import Commands
 from makebreak.gap.simulation.driven_arm import DrivenArmSimulation
 from makebreak.gap.simulation.measure import gap_measure
@@ -23,14 +24,19 @@ KP, KD = np.array([80.0, 50.0]), np.array([6.0, 3.0])
 NOISE = 3e-4  # [rad] of the encoders.
 
 
-def scene_and_log(folder, kp=KP, kd=KD):
-    """A scene with KP and KD, and a log of one with other gains, 100 rows a second."""
-    drive = ActuationSection(type="servo", joints=JOINTS, kp=list(KP), kd=list(KD))
+def scene_and_log(folder, kp=KP, kd=KD, follows="position", hidden=()):
+    """A scene with KP and KD, and a log of one with other gains and hidden effects, 100
+    rows a second."""
+    of_type = {"position": "servo", "velocity": "velocity"}[follows]
+    drive = ActuationSection(
+        type=of_type, joints=JOINTS, kp=list(KP) if len(kp) else [], kd=list(KD)
+    )
     scene = replace(double(folder), actuation=drive)
-    truth = replace(scene, actuation=replace(drive, kp=list(kp), kd=list(kd)))
+    truth = replace(scene, actuation=replace(drive, kp=list(kp), kd=list(kd)),
+                    effects=list(hidden))  # fmt: skip
     time = np.arange(0.0, 20.0, 0.01)
     told = np.stack([0.5 * np.sin(2.0 * time), 0.6 * np.sin(3.1 * time + 1.0)])
-    columns = dict(zip((f"{j}.position_command" for j in JOINTS), told, strict=True))
+    columns = dict(zip((f"{j}.{follows}_command" for j in JOINTS), told, strict=True))
     names = [f"{j}.position" for j in JOINTS]
     rows = DrivenArmSimulation(truth).run(
         at_rest_but(dict(zip(JOINTS, told[:, 0], strict=True))), time, names,
@@ -111,3 +117,49 @@ def test_columns_are_what_a_gain_takes_off_the_equations(tmp_path, i):
         # The residual is linear in both gains.
         np.testing.assert_allclose(column, off, atol=1e-6 * np.abs(off).max())
         assert np.abs(off).max() > 1.0
+
+
+@pytest.mark.parametrize("i", range(2))
+def test_a_gain_of_a_velocity_drive_is_of_what_follows_its_command(tmp_path, i):
+    """Damping of the joint, which the drive does not follow, is no gain of it."""
+    scene, recordings = scene_and_log(tmp_path, kp=[], follows="velocity")
+    model = InverseModel(scene, recordings)
+    columns, _, names = gain_columns(model)
+    assert names == [f"drive_gains of {joint}, kd" for joint in JOINTS]
+    more, drive = 1e-3, scene.actuation
+    gains = [kd * (1.0 + more * (k == i)) for k, kd in enumerate(KD)]
+    stiffer = replace(scene, actuation=replace(drive, kd=gains))
+    other = InverseModel(stiffer, recordings)
+    off = model.in_units(model.base()) - other.in_units(other.base())
+    column = model.in_units(columns[i])
+    largest = np.abs(off).max() / more
+    np.testing.assert_allclose(column, off / more, atol=1e-6 * largest)
+    damped = Effect("joint_viscous_damping", [JOINTS[i]], {"damping": more * KD[i]})
+    off = model.in_units(model.base() - model.residual([damped]))
+    assert np.abs(column - off / more).max() > 0.5 * largest
+
+
+def test_damping_of_a_joint_with_a_velocity_drive_is_no_gain(tmp_path):
+    """Nothing sticks: what slow rows lack is not what friction holds."""
+    hidden = Effect("joint_viscous_damping", ["d.j2"], {"damping": 0.1 * KD[1]})
+    scene, recordings = scene_and_log(
+        tmp_path, kp=[], follows="velocity", hidden=[hidden]
+    )
+    problem = MechanismProblem(scene, recordings)
+    n = problem.nuisances()
+    screen = Screen(problem.base(), n.columns, n.prior, problem.train(), reach=n.reach)
+    _, without = screen.fit_nuisances(problem.base())
+    _, right = screen.fit_nuisances(problem.residual([hidden]))
+    assert problem.noise_error(right) < 1.3
+    assert problem.noise_error(without) > 3.0
+
+
+def test_a_drive_gives_what_it_asks_for_most_of_the_time(tmp_path):
+    """Else light links that are given nothing would need nothing."""
+    scene, recordings = scene_and_log(tmp_path)
+    model = InverseModel(scene, recordings)
+    (motion,) = model.motions()
+    asked = np.abs(motion.effort[np.abs(motion.v[:, 1]) > 0.005, 1])
+    least = model.least("actuator_saturation", ["d.j2"])
+    assert least == {"limit": pytest.approx(np.median(asked))}
+    assert "limit" not in model.least("joint_coulomb_friction", ["d.j2"])

@@ -112,6 +112,10 @@ def test_numbers_of_drives_go_with_their_joints(tmp_path):
     recordings = split(read_recordings([recorded(tmp_path, [], 2.0)[1]]))
     own, _ = only(LIMBS[1], replace(scene, actuation=act), recordings)
     assert own.actuation.kp == [3.0, 4.0] and own.actuation.kd == [0.5]
+    # A limb without a drive is one that nothing drives: its scene loads.
+    act = replace(act, joints=LIMBS[0], kp=[1.0, 2.0])
+    own, _ = only(LIMBS[1], replace(scene, actuation=act), recordings)
+    assert not SceneDynamics(own).loaded.scene.actuation.joints
 
 
 def test_the_gain_of_all_drives_of_a_model_is_known_where_they_are_alike(tmp_path):

@@ -93,7 +93,7 @@ class ContactCandidates(ContactRows):
                 columns.append(X)
                 readers.append(reader_of_trial(kind, names, trial))
             if columns:
-                least = self.least(kind, [at])
+                least = self.dynamics.least(kind, [at])
                 found.append(
                     Candidate(kind, tuple(places), size, tuple(columns),
                               tuple(readers), fixed, least=least)

@@ -2,8 +2,7 @@
 
 A scene's `tolerance: {drive_gains: 0.05}` says how well they are known. What a drive's
 stiffness and damping give may then be off by that share, and is no effect. Where it
-does not say, they are known to KNOWN_TO in simulated windows, which show less than
-that, and exactly in equations of motion.
+does not say, they are known to KNOWN_TO.
 """
 
 from collections.abc import Iterator, Sequence
@@ -34,7 +33,7 @@ def gain_changes(
 
 
 def gains_known_to(scene: Scene) -> float:
-    """The share of a gain to which simulated windows take it to be known."""
+    """The share of a gain to which it is taken to be known."""
     return float(scene.tolerance.get(KEY, KNOWN_TO))
 
 
@@ -75,8 +74,7 @@ def gain_columns(model) -> tuple[list[np.ndarray], list[float], list[str]]:
                     less[:, i, 0] = effect.parameters["damping"] / size * motion.v[:, i]
                     told = track.commands.get(f"{joint}.velocity_command")
                     if told is not None:
-                        kd = float(law_of(model.scene.actuation, joint).kd)
-                        less[:, i, 0] -= kd * track.mean_held(told, 0.0)
+                        less[:, i, 0] -= model.laws[i].kd * track.mean_held(told, 0.0)
                 else:
                     other = model.motion(track, [effect]).effort
                     less[:, i, 0] = (motion.effort - other)[:, i] / size

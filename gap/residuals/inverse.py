@@ -310,9 +310,9 @@ class InverseModel(WhitenedRows):
 
     def loop_timing(self) -> tuple[list[np.ndarray], list[float], list[str]]:
         """Columns (m,) of the residual, standard deviations [s] and names of what is
-        not known of fast loops: by how much the velocity that a drive feeds back is
-        late (a late position is damping, which is looked for), and efforts that were
-        commanded at a row, and hold until the loop gives the next."""
+        not known of fast loops: by how much a position and a velocity that a drive
+        feeds back are late, and efforts that were commanded at a row, and hold until
+        the loop gives the next."""
         columns, names = [], []
         efforts = []
         sampled = [
@@ -331,15 +331,19 @@ class InverseModel(WhitenedRows):
             columns.append(self.columns_of(efforts)[:, 0])
             names.append("input_delay of all joints, loop")
         for i, law in enumerate(self.laws):
-            if law is None or not self.commanded[i] or not law.kd > 0.0:
+            if law is None or not self.commanded[i]:
                 continue
-            efforts = []
-            for motion in self.motions():
-                late = np.zeros((*motion.v.shape, 1))
-                late[:, i, 0] = law.kd * motion.vd[:, i]
-                efforts.append(late)
-            columns.append(self.columns_of(efforts)[:, 0])
-            names.append(f"input_delay of {self.joints[i]}, loop")
+            for fed_back, gain in (("position", law.kp), ("velocity", law.kd)):
+                if not gain > 0.0:
+                    continue
+                efforts = []
+                for motion in self.motions():
+                    late = np.zeros((*motion.v.shape, 1))
+                    rate = motion.v if fed_back == "position" else motion.vd
+                    late[:, i, 0] = gain * rate[:, i]
+                    efforts.append(late)
+                columns.append(self.columns_of(efforts)[:, 0])
+                names.append(f"input_delay of {self.joints[i]}, loop of its {fed_back}")
         return columns, [LOOP_SEC] * len(columns), names
 
     def least(self, kind: str, at: Sequence[str]) -> dict[str, float]:
