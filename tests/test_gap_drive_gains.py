@@ -141,7 +141,7 @@ def test_a_gain_of_a_velocity_drive_is_of_what_follows_its_command(tmp_path, i):
 
 def test_damping_of_a_joint_with_a_velocity_drive_is_no_gain(tmp_path):
     """Nothing sticks: what slow rows lack is not what friction holds."""
-    hidden = Effect("joint_viscous_damping", ["d.j2"], {"damping": 0.1 * KD[1]})
+    hidden = Effect("joint_viscous_damping", ["d.j2"], {"damping": 0.05 * KD[1]})
     scene, recordings = scene_and_log(
         tmp_path, kp=[], follows="velocity", hidden=[hidden]
     )
@@ -151,7 +151,7 @@ def test_damping_of_a_joint_with_a_velocity_drive_is_no_gain(tmp_path):
     _, without = screen.fit_nuisances(problem.base())
     _, right = screen.fit_nuisances(problem.residual([hidden]))
     assert problem.noise_error(right) < 1.3
-    assert problem.noise_error(without) > 3.0
+    assert problem.noise_error(without) > 2.0
 
 
 def test_a_drive_gives_what_it_asks_for_most_of_the_time(tmp_path):
