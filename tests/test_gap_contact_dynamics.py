@@ -268,7 +268,7 @@ def test_a_side_of_a_patch_that_nothing_crosses_is_said_not_to_be_known(tmp_path
 def free_patch(friction: float) -> _Free:
     """What a fit may move of a patch."""
     return _Free(
-        SimpleNamespace(dynamics=SimpleNamespace(least=lambda kind, at: {})),
+        SimpleNamespace(least=lambda kind, at: {}),
         [Effect("friction_patch", [PAIR], {"friction": friction, "x_min": 0.0,
                 "x_max": 0.1, "y_min": 0.0, "y_max": 0.1})], [()],
     )  # fmt: skip

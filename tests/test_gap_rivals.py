@@ -31,8 +31,8 @@ def together(monkeypatch, one: Effect, other: Effect, fitted, std):
     """Two rivals as they are compared, and what their fit together is."""
     found = SimpleNamespace(fitted=SimpleNamespace(effects=fitted, std=std))
     monkeypatch.setattr(rivals, "fit_together", lambda *arguments: found)
-    dynamics = SimpleNamespace(least=lambda kind, at: {})
-    search = SimpleNamespace(problem=SimpleNamespace(dynamics=dynamics), nuisances=None)
+    problem = SimpleNamespace(least=lambda kind, at: {})
+    search = SimpleNamespace(problem=problem, nuisances=None)
     both = rivals.Rivals(search).together(  # type: ignore[arg-type]
         [], trial(one), trial(other)
     )

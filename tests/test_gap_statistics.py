@@ -417,7 +417,10 @@ class Steps:
     """r = |x - 0.3| in steps of 0.02, and what slopes say of it: nothing."""
 
     plan = SearchPlan(jumps=True)
-    dynamics = SimpleNamespace(least=lambda kind, at: {}, now=lambda kind, at: {})
+    dynamics = SimpleNamespace(now=lambda kind, at: {})
+
+    def least(self, kind, at):
+        return {}
 
     def apart(self, effects, names):
         return []
@@ -1131,8 +1134,9 @@ def test_a_patch_beside_others_is_told_by_how_far_it_may_end(
     at_end = dict.fromkeys(patch.parameters, slopes)
     choice = Choice(patch, at_end, 2.0, after, "", 1.0, (), (), 5)
     moved = {"friction": 1e-3} | dict.fromkeys(sides, far)
-    dynamics = SimpleNamespace(least=lambda kind, at: {})
-    problem = SimpleNamespace(widened=lambda end, k: (moved, ()), dynamics=dynamics)
+    problem = SimpleNamespace(
+        widened=lambda end, k: (moved, ()), least=lambda kind, at: {}
+    )
     search = SimpleNamespace(problem=problem)
     chosen = [choice, *others * [replace(choice)]]
     assert _is_certain(search, chosen, None, 0) == named
@@ -1149,11 +1153,11 @@ def test_a_friction_that_may_be_what_the_scene_has_is_not_named(
     sticks may have any larger one."""
     effect = Effect("contact_friction", ["box.box~tip.tip"], {"friction": friction})
     choice = Choice(effect, {"friction": 0.01}, 1.7, 1.3, "", 1.0, (), (), 1)
-    dynamics = SimpleNamespace(
-        least=lambda kind, at: {}, now=lambda kind, at: {"friction": 0.388}
-    )
+    dynamics = SimpleNamespace(now=lambda kind, at: {"friction": 0.388})
     problem = SimpleNamespace(
-        widened=lambda end, k: ({"friction": far}, or_more), dynamics=dynamics
+        widened=lambda end, k: ({"friction": far}, or_more),
+        dynamics=dynamics,
+        least=lambda kind, at: {},
     )
     search = SimpleNamespace(problem=problem)
     assert _is_certain(search, [choice], None, 0) == named
