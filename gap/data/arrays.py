@@ -201,9 +201,8 @@ def _table(path: Path, names: Sequence[str], load: Callable, most_cells: int) ->
         if value is None or value.dtype.kind not in "iufbMUS":
             lost.append(name)
         elif value.dtype.kind in "US":
-            if (
-                value.ndim == 2 and (value == value[0]).all()
-            ):  # As in each line of JSON.
+            # The same names in each row, as lines of JSON have them.
+            if value.ndim == 2 and len(value) and (value == value[0]).all():
                 value = value[0]
             if value.ndim == 1 and len(value) not in labels or _of_joints(name):
                 labels[value.size] = tuple(_text(each) for each in value.ravel())

@@ -55,10 +55,8 @@ FEW, MOST_LATE = 100, 300  # Instants at which many readings, or delays, are tri
 ALL_ORDERS, MOST_ORDERED = 6, 8  # Joints of which all orders, or swaps, are tried.
 ROOM = 0.1  # Of a joint's range, beyond it.
 ONE_GEAR = 0.03  # Of a gear: it is as round as that lets it be.
-GEARS, ROUNDS = (
-    (30.0, 60.0, 100.0, 160.0),
-    15,
-)  # From which, and in which, gears are found.
+# Gears from which a search for them starts, and its rounds.
+GEARS, ROUNDS = (30.0, 60.0, 100.0, 160.0), 15
 LEAST_READ = 1e-4  # A share: of less no other reading is better.
 _MOTION = ("position", "velocity")
 FAR = 1000.0  # [rad] No joint turns by so much between its limits.

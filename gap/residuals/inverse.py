@@ -351,9 +351,10 @@ class InverseModel(WhitenedRows):
         positions gives what its law asks for most of the time that its joint moves.
         (With next to no limit, light links need nothing and are given nothing.)"""
         found = self.dynamics.least(kind, at)
+        if KINDS[kind].path != "saturation":
+            return found
         for i, joint in enumerate(self.joints):
-            bounded = KINDS[kind].path == "saturation" and joint in at
-            if not bounded or self.laws[i] is None:
+            if joint not in at or self.laws[i] is None:
                 continue
             asked = np.concatenate([
                 np.abs(m.effort[:, i])[np.abs(m.v[:, i]) > self._rest[i]]

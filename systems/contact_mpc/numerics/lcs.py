@@ -76,10 +76,8 @@ class LCS:
     def with_residual(self, r_comp, phi_more=None) -> "LCS":
         """This LCS with the offset c + r_comp, r_comp (n_lam,) [m/s] (eq. 12), and with
         phi + phi_more (n_lam,) [m]."""
-        lcs, n = (
-            object.__new__(LCS),
-            (self.n_lam,),
-        )  # The other fields have been checked.
+        lcs = object.__new__(LCS)  # The other fields have been checked.
+        n = (self.n_lam,)
         vars(lcs).update(vars(self), c=_own("c", self.c + r_comp, n))
         if phi_more is not None:
             vars(lcs).update(phi=_own("phi", self.phi + phi_more, n))
