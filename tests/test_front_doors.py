@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from front_doors import KINDS, ROBOTS, exact, one
 
-from makebreak.gap.data.content import check_contents, likeness
+from makebreak.gap.data.content import Reading, check_contents, likeness
 from makebreak.gap.data.reading import read_recording, read_recordings
 from makebreak.gap.data.reshaped import reshaped
 from makebreak.gap.data.robot import propose_scene, read_log, read_robot
@@ -431,3 +431,14 @@ def test_columns_that_are_counted_are_of_the_order_that_the_efforts_go_with(tmp_
     proposal = propose_scene(robot, [read_log(lines)])
     assert proposal.said == ()
     assert "q/j3: limbs.j3.position" in proposal.sidecars[lines]
+
+
+def test_a_reading_scaled_has_its_zero_in_the_new_unit():
+    """What was read, times a factor: a zero that was found in degrees, too."""
+    reading = Reading((1, 0), np.array([1.0, -2.0]), np.array([0.3, 0.5]))
+    q = np.array([0.7, -0.4])
+    other = reading.scaled([1], 0.1)
+    np.testing.assert_allclose(
+        q * other.scale + other.zero, (q * reading.scale + reading.zero) * [1.0, 0.1]
+    )
+    assert other.order == reading.order
