@@ -51,6 +51,7 @@ EXACT = {
         dict(fx=2.0, fy=0.0, fz=0.5, frequency=1.5, phase=0.4),
     ),
     "body_drag": ("d.lower", dict(linear=0.8, angular=0.05)),
+    "body_quadratic_drag": ("d.lower", dict(coefficient=0.6)),
     "object_mass": ("d.lower", dict(mass=1.1)),
     "object_inertia": ("d.lower", dict(ixx=0.03, iyy=0.035, izz=0.02)),
     "link_mass": ("d.lower", dict(mass=-0.3)),

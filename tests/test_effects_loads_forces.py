@@ -1,5 +1,6 @@
 """Payload, links, tilt, and forces on a body."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -291,6 +292,28 @@ def test_a_free_ball_moves_as_the_closed_form_says(tmp_path, kind, time_step, at
     np.testing.assert_allclose(rows[:, :3], path + [0, 0, 50.0], atol=atol)
     spin = np.exp(-parameters.get("angular", 0.0) / 2.7783e-5 * t)
     np.testing.assert_allclose(rows[:, 3], 7.0 * spin, atol=7.0 * max(atol, 1e-5))
+
+
+@pytest.mark.parametrize("time_step, rtol", [(0.0, 1e-6), (0.0005, 2e-3)])
+def test_drag_with_the_square_of_the_speed_acts_against_it(tmp_path, time_step, rtol):
+    """Without gravity along a slanted line: v = v0/(1 + k v0 t), k = c/m; and a fall
+    ends at sqrt(m g/c)."""
+    m, c, v0 = 0.07, 0.05, np.array([2.0, -1.0, 2.0])
+    drag = ("body_quadratic_drag", "b.ball", {"coefficient": c})
+    scene = with_effects(on_ground(tmp_path, "ball", time_step, z=50.0), drag)
+    simulation = SceneSimulation(scene)
+    names = [f"b.ball.v{a}" for a in "xyz"]
+    u = np.sqrt(m * G / c)
+    start = at_rest_but(body="b.ball", pose=[1, 0, 0, 0, 0, 0, 50.0])
+    (_, v) = simulation.run(start, np.array([0.0, 1.5]), names)
+    np.testing.assert_allclose(v, [0, 0, -u * np.tanh(G * 1.5 / u)], rtol=rtol,
+                               atol=1e-9)  # fmt: skip
+    scene = replace(scene, plant=replace(scene.plant, gravity=[0.0, 0.0, 0.0]))
+    moving = at_rest_but(
+        body="b.ball", pose=[1, 0, 0, 0, 0, 0, 50.0], twist=[0, 0, 0, *v0]
+    )
+    (_, v) = SceneSimulation(scene).run(moving, np.array([0.0, 1.0]), names)
+    np.testing.assert_allclose(v, v0 / (1.0 + c / m * 3.0), rtol=rtol)
 
 
 def test_a_sinusoidal_force_goes_with_the_recordings_clock(tmp_path):

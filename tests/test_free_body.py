@@ -59,6 +59,7 @@ def scene(tmp_path_factory):
         Effect("plane_tilt", ["ground"], {"roll": 0.02, "pitch": -0.03}),
         Effect("wall_position", ["ground"], {"x": 0.02, "z": -0.004}),
         Effect("body_drag", ["cube.cube"], {"linear": 0.4, "angular": 1e-4}),
+        Effect("body_quadratic_drag", ["cube.cube"], {"coefficient": 0.03}),
         Effect("constant_force", ["cube.cube"], {"fx": 0.1, "fy": -0.2, "fz": 0.3}),
     ],
     ids=lambda e: e.kind,
@@ -92,6 +93,24 @@ def test_the_steps_follow_drakes_continuous_plant_through_an_impact(scene):
     assert np.abs(np.diff(want[:, 12])).max() > 0.2  # It has hit [m/s].
     np.testing.assert_allclose(got[:, 4:7], want[:, 4:7], atol=3e-5)
     np.testing.assert_allclose(got[:, :4], want[:, :4], atol=3e-4)
+
+
+def test_drag_with_the_square_of_the_speed_lets_a_body_fall_no_faster_than_its_end_speed(
+    scene,
+):
+    # From rest v = -u tanh(g t/u), z = -(u2/g) ln cosh(g t/u); u2 = m g/c.
+    body = FreeBodyScene(scene).body(
+        [Effect("body_quadratic_drag", ["cube.cube"], {"coefficient": 0.05})]
+    )
+    g, times = -body.gravity[2], np.linspace(0.0, 4.0, 9)
+    u = np.sqrt(body.mass * g / 0.05)
+    body = replace(body, com=np.zeros(3))
+    start = np.array([1.0, 0, 0, 0, 0, 0, 200.0, 0, 0, 0, 0, 0, 0])
+    x = simulate(body, start, times, tol=1e-9)
+    fallen = u**2 / g * np.log(np.cosh(g * times / u))
+    np.testing.assert_allclose(x[:, 6], 200.0 - fallen, atol=1e-6)
+    np.testing.assert_allclose(x[:, 12], -u * np.tanh(g * times / u), atol=1e-6)
+    assert abs(x[-1, 12]) > 0.9 * u
 
 
 def test_a_scene_with_more_than_one_free_body_is_refused(scene):
@@ -185,7 +204,7 @@ def test_a_wall_that_stands_on_a_table_goes_on_into_it():
         body = FreeBody(
             1.0, np.zeros(3), np.eye(3), np.zeros(3), np.array([corner]),
             fixed[1:], np.zeros((1, 1, 6)), np.zeros((1, 1)), np.zeros((0, 6)),
-            np.zeros(2),
+            np.zeros(3),
         )  # fmt: skip
         _, normal, _ = nearest(body, np.array([1, 0, 0, 0, 0.451, 0, 2e-4]))
         np.testing.assert_allclose(normal, [-1.0, 0.0, 0.0])

@@ -23,7 +23,7 @@ def box(**other):
         inertia=np.diag([1e-3, 2e-3, 2.5e-3]),
         gravity=np.array([0.0, 0.0, -9.81]), spheres=np.array([[0.0, 0.0, 0.0, 0.03]]),
         fixed=np.zeros((1, 15)), pairs=np.zeros((1, 1, 6)), levers=np.zeros((1, 1)),
-        forces=np.zeros((0, 6)), drag=np.zeros(2),
+        forces=np.zeros((0, 6)), drag=np.zeros(3),
     )  # fmt: skip
     return FreeBody(**(numbers | other))
 

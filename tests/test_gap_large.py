@@ -344,7 +344,7 @@ def test_boxes_that_are_far_change_nothing():
         body = FreeBody(
             0.1, np.zeros(3), 1e-5 * np.eye(3), np.array([0.0, 0.0, -9.81]),
             np.array([[0.0, 0.0, 0.0, 0.02]]), fixed, np.tile(pair, (1, n, 1)),
-            np.zeros((1, n)), np.zeros((0, 6)), np.zeros(2),
+            np.zeros((1, n)), np.zeros((0, 6)), np.zeros(3),
         )  # fmt: skip
         start = np.array([1.0, 0, 0, 0, -0.15, 0, 0.06, 0, 3.0, 0, 0.4, 0, 0])
         return simulate(body, start, np.linspace(0.0, 0.4, 41))

@@ -160,7 +160,7 @@ def test_a_face_is_where_the_nearest_approach_ended_unless_it_stayed_there():
     fixed = np.array([[*np.eye(3).ravel(), 1.0, 0.0, 0.0, 0.2, 2.0, 2.0]])
     body = FreeBody(
         1.0, np.zeros(3), np.eye(3), np.zeros(3), np.array([[0.0, 0.0, 0.0, 0.1]]),
-        fixed, np.zeros((1, 1, 6)), np.zeros((1, 1)), np.zeros((0, 6)), np.zeros(2),
+        fixed, np.zeros((1, 1, 6)), np.zeros((1, 1)), np.zeros((0, 6)), np.zeros(3),
     )  # fmt: skip
 
     def path(x) -> np.ndarray:

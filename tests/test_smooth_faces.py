@@ -47,7 +47,7 @@ def ball(fixed, radius=BALL, mu=0.4, names=None, **other) -> FreeBody:
     return FreeBody(
         mass, np.zeros(3), 0.4 * mass * radius**2 * np.eye(3), 9.81 * DOWN,
         np.array([[0.0, 0.0, 0.0, radius]]), fixed, np.tile(pair, (1, n, 1)),
-        np.zeros((1, n)), np.zeros((0, 6)), np.zeros(2),
+        np.zeros((1, n)), np.zeros((0, 6)), np.zeros(3),
         smooth=smooth_faces(fixed, names or ["bowl"] * n), **other,
     )  # fmt: skip
 

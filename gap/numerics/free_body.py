@@ -67,7 +67,7 @@ class FreeBody:
     pairs: np.ndarray
     levers: np.ndarray
     forces: np.ndarray
-    drag: np.ndarray  # (2,) linear [N s/m], angular [N m s/rad]
+    drag: np.ndarray  # (3,) linear [N s/m], angular [N m s/rad], quadratic [N s2/m2]
     slip: float = 1e-3  # v_s [m/s]
     fade: float = 0.05  # Below this rate rolling resistance fades [rad/s].
     patches: np.ndarray = field(default_factory=lambda: np.zeros((0, 6)))
@@ -78,6 +78,8 @@ class FreeBody:
         shape = (len(self.spheres), len(self.fixed), 6)
         if self.pairs.shape != shape:  # Compiled steps would read beyond its end.
             raise ValueError(f"FreeBody.pairs is {self.pairs.shape}, expected {shape}")
+        if self.drag.shape != (3,):
+            raise ValueError(f"FreeBody.drag is {self.drag.shape}, expected (3,)")
 
 
 @dataclass(frozen=True, eq=False)
@@ -626,9 +628,11 @@ def _rate(t, s, mass, com, inertia, inverse, gravity, spheres, owner, fixed, pai
         for i in range(3):
             F[b, i] = mass[b] * gravity[i]
             o[b, i] = -(R[i, 0] * com[b, 0] + R[i, 1] * com[b, 1] + R[i, 2] * com[b, 2])
-        f[b, 0] = -drag[b, 0] * (s[b, 10] + w1 * o[b, 2] - w2 * o[b, 1])
-        f[b, 1] = -drag[b, 0] * (s[b, 11] + w2 * o[b, 0] - w0 * o[b, 2])
-        f[b, 2] = -drag[b, 0] * (s[b, 12] + w0 * o[b, 1] - w1 * o[b, 0])
+        v0 = s[b, 10] + w1 * o[b, 2] - w2 * o[b, 1]
+        v1 = s[b, 11] + w2 * o[b, 0] - w0 * o[b, 2]
+        v2 = s[b, 12] + w0 * o[b, 1] - w1 * o[b, 0]
+        slowed = drag[b, 0] + drag[b, 2] * np.sqrt(v0**2 + v1**2 + v2**2)
+        f[b, 0], f[b, 1], f[b, 2] = -slowed * v0, -slowed * v1, -slowed * v2
     for j in range(len(forces)):
         size = 1.0
         if forces[j, 3] > 0.0:

@@ -51,8 +51,10 @@ CELLS, LEAST_CELL = 6, 0.01  # [m]
 # A side is moved by so many steps of so much of a cell, most often so many times.
 PATCH_ROUNDS, PATCH_STEPS, PATCH_REACH = 12, (0.25, 0.05), 20
 # Kinds that an unmeasured force on a mechanism would show as; those of free bodies.
-_OF_BODIES = ("constant_force", "body_drag", "object_mass", "object_com",
+_OF_BODIES = (*(k for k, e in KINDS.items() if e.body_law), "object_mass", "object_com",
               "object_inertia", "length_scale")  # fmt: skip
+# Of a force that grows with a body's speed: tried for each kilogram of it.
+_DRAGS = {"N s/m": 0.3, "N m s/rad": 3e-4, "N s2/m2": 0.1}
 
 
 def contact_nuisances(model: FreeBodyModel | WindowModel) -> Nuisances:
@@ -173,14 +175,12 @@ def _trials(model, kind: str, at: str):
              for f in _INERTIAS],
             names, (),
         )  # fmt: skip
-    elif kind == "body_drag":
-        zero = {"linear": 0.0, "angular": 0.0}
+    elif all(p.unit in _DRAGS for p in KINDS[kind].parameters):
         mass = model.dynamics.now("object_mass", [at])["mass"]
-        for name, step, other in (
-            ("linear", 0.3 * mass, "angular"),
-            ("angular", 0.3 * mass * 1e-3, "linear"),
-        ):
-            yield [[(step, {**zero, name: step})]], (name,), (other,)
+        none = {p.name: 0.0 for p in KINDS[kind].parameters}
+        for p in KINDS[kind].parameters:
+            step, others = _DRAGS[p.unit] * mass, tuple(n for n in none if n != p.name)
+            yield [[(step, {**none, p.name: step})]], (p.name,), others
     elif kind == DAMPER:
         if not isinstance(model, FreeBodyModel):
             return  # Drake's steps bound it, and are too long.

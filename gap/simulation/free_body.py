@@ -55,8 +55,7 @@ RIGID = 1e12  # [N/m]
 AT_CORNERS = 0.4  # Of a face's load; it is 0.16 (a disc's rim: 0.33) if pressed evenly.
 # Forces that have their own numbers here; what changes shapes, inertias and surfaces is
 # read off the plant.
-FORCES = ("constant_force", "sinusoidal_force", "body_drag", "rolling_resistance",
-           DAMPER)  # fmt: skip
+FORCES = (*(k for k, e in KINDS.items() if e.body_law), "rolling_resistance", DAMPER)
 SURFACES = ("contact_friction", "contact_stiffness", "contact_dissipation")
 SENSORS = ("length_scale", "sensor_delay", "sensor_bias", "clock_skew")
 _PLANT = ("object_size", "corner_radius", "object_mass", "object_com", "object_inertia",
@@ -354,7 +353,7 @@ class FreeBodyScene:
             solid,
             np.array(origins).reshape(-1, 3),
             own[of], other,
-            np.zeros(len(others)), np.zeros((0, 6)), np.zeros(2), np.zeros((0, 6)),
+            np.zeros(len(others)), np.zeros((0, 6)), np.zeros(3), np.zeros((0, 6)),
             np.full(len(others), np.nan), np.array(role), np.array(inner),
             np.array(rims), np.array(boxes).reshape(-1, 15),
         )  # fmt: skip
@@ -633,7 +632,7 @@ def _force(now: Numbers, p, on) -> None:
 
 
 def _drag(now: Numbers, p, on) -> None:
-    now.drag += [p["linear"], p["angular"]]
+    now.drag += [p.get(name, 0.0) for name in ("linear", "angular", "coefficient")]
 
 
 def _patch(now: Numbers, p, on) -> None:
@@ -651,5 +650,5 @@ CHANGES = {
     "contact_stiffness": _stiffness, "contact_dissipation": _dissipation,
     "plane_height": _height, "plane_tilt": _tilt, "rolling_resistance": _rolling,
     "constant_force": _force, "sinusoidal_force": _force, "body_drag": _drag,
-    DAMPER: _damper, PLACE: _displace,
+    "body_quadratic_drag": _drag, DAMPER: _damper, PLACE: _displace,
 }  # fmt: skip

@@ -1,4 +1,4 @@
-"""Effects that are forces on a body: constant, sinusoidal, drag."""
+"""Effects that are forces on a body: constant, sinusoidal, drags."""
 
 import math
 
@@ -35,6 +35,13 @@ def drag_law(V, t, p, F):
     for i in range(3):
         F[i] -= p[1] * V[i]
         F[3 + i] -= p[0] * V[3 + i]
+
+
+@numba.njit(cache=True)
+def quadratic_drag_law(V, t, p, F):
+    speed = math.sqrt(V[3] ** 2 + V[4] ** 2 + V[5] ** 2)
+    for i in range(3):
+        F[3 + i] -= p[0] * speed * V[3 + i]
 
 
 def _numbers(*names):
@@ -109,6 +116,15 @@ def _drag_signature(effect, model, motion, grid=None) -> list[Signature]:
     return [without_momentum(effect, ["linear", "angular"], columns)]
 
 
+def _quadratic_drag_signature(effect, model, motion, grid=None) -> list[Signature]:
+    columns = np.zeros((*motion.v.shape, 1))
+    for J, V in _jacobians(effect, model, motion):
+        v = V[:, 3:]
+        squares = np.linalg.norm(v, axis=1, keepdims=True) * v
+        columns[:, :, 0] += np.einsum("nij,ni->nj", J[:, 3:], squares)
+    return [without_momentum(effect, ["coefficient"], columns)]
+
+
 TRIED_FREQUENCIES = list(np.arange(0.4, 5.01, 0.03))  # [Hz]
 
 KINDS = {
@@ -150,11 +166,26 @@ KINDS = {
             Parameter("angular", "N m s/rad", 0.0, 10.0, valid=">= 0"),
         ),
         says="{at} is slowed by drag of {linear} and {angular} that the model lacks",
-        confused_with=("joint_viscous_damping", "joint_quadratic_drag"),
+        confused_with=(
+            "joint_viscous_damping",
+            "joint_quadratic_drag",
+            "body_quadratic_drag",
+        ),
         tell_apart="move several joints at once: drag acts along the body's velocity",
         body_law=drag_law,
         body_numbers=_numbers("linear", "angular"),
         signature=_drag_signature,
         may_lack=("angular",),  # Few bodies show that turning slows them.
+    ),
+    "body_quadratic_drag": EffectKind(
+        at="body",
+        parameters=(Parameter("coefficient", "N s2/m2", 0.0, 20.0, valid=">= 0"),),
+        says="{at} is slowed by drag that grows with the square of its speed, "
+        "{coefficient}, that the model lacks",
+        confused_with=("body_drag", "joint_quadratic_drag", "constant_force"),
+        tell_apart="move the body at speeds that differ by a factor of three or more",
+        body_law=quadratic_drag_law,
+        body_numbers=_numbers("coefficient"),
+        signature=_quadratic_drag_signature,
     ),
 }
