@@ -62,31 +62,33 @@ def fit_effects(
         rows = np.append(rows, problem.prior_rows(free.effects(z)))
         return np.where(np.isfinite(rows), rows, 1e6)
 
-    sets = problem.apart(start, free.names)
-    masks = [problem.moved_by(start[i]) for i, _ in free.names] if sets else []
+    sets = problem.apart(start, free.names) or [[k] for k in range(len(x0))]
+    masks = [problem.moved_by(start[i]) for i, _ in free.names]
 
     def slopes(z) -> np.ndarray:
-        """(n, k) of the cost's rows, of sets of parameters at once."""
+        """(n, k) of the cost's rows, of sets of parameters at once; to the other side
+        where a model cannot have what is on one."""
         r, rows = residual(z), cost(z)
         J = np.zeros((len(rows), len(z)))
         h = problem.plan.diff_step * np.maximum(np.abs(z), 0.3)
         h = np.where(z + h > free.high / scale, -h, h)
         for some in sets:
-            moved = np.array(z)
-            moved[some] += h[some]
-            try:
-                off = residual(moved) - r
-            except (ValueError, RuntimeError):
-                continue
-            for k in some:
-                there = screen.cost_rows(r + np.where(masks[k], off, 0.0))
-                J[: len(there), k] = (there - rows[: len(there)]) / h[k]
+            for step in (h, -h):
+                moved = np.array(z)
+                moved[some] += step[some]
+                try:
+                    off = residual(moved) - r
+                except (ValueError, RuntimeError):
+                    continue
+                for k in some:
+                    there = screen.cost_rows(r + np.where(masks[k], off, 0.0))
+                    J[: len(there), k] = (there - rows[: len(there)]) / step[k]
+                break
         return J
 
     solved = least_squares(
-        cost, x0 / scale, slopes if sets else "2-point",
-        bounds=(low / scale, free.high / scale),
-        diff_step=problem.plan.diff_step, x_scale=1.0, xtol=1e-6,
+        cost, x0 / scale, slopes, bounds=(low / scale, free.high / scale),
+        x_scale=1.0, xtol=1e-6,
         ftol=1e-6 if steps > SHORT else 1e-4, max_nfev=steps,
     ) if len(x0) else None  # fmt: skip
     z = x0 / scale if solved is None else solved.x

@@ -106,7 +106,8 @@ class Likeness:
 
 @dataclass(frozen=True)
 class Told:
-    """What a joint needs = factor effort + bias - friction - rotor, but for a share."""
+    """effort = (what its joint needs - bias) / factor, with friction and a rotor's
+    inertia beside it, but for a share that is left."""
 
     left: float
     factor: float
@@ -325,19 +326,23 @@ class Contents:
         return likeness(self.needed[:, i], y, np.stack(rest, axis=1), halves)
 
     def told(self, name: str, i: int) -> Told:
-        """What an effort tells beside a bias, friction and a rotor's inertia, which
-        never drive."""
+        """What an effort is, of either sign, beside a bias, friction and a rotor's
+        inertia, which never drive."""
         y, needed = self.column(name), self.needed[:, i]
         v, vd = self.v[:, i], self.vd[:, i]
         if y is None or not (np.ptp(y) > 0.0 and np.ptp(needed) > 0.0):
             return Told(1.0, 1.0, 0.0)
         one = np.ones_like(v)
-        X = np.stack([y, -y, one, -one, -v, -np.sign(v), -vd], axis=1)
+        X = np.stack([needed, one, -one, v, np.sign(v), vd], axis=1)
         size = np.maximum(np.abs(X).max(axis=0), 1e-300)
-        c, off = nnls(X / size, needed)
+        c, off, sign = min(
+            ((*nnls(X / size, sign * y), sign) for sign in (1.0, -1.0)),
+            key=lambda each: each[1],
+        )
         c = c / size
-        left = off**2 / (np.var(needed) * len(v))
-        return Told(float(left), float(c[0] - c[1]), float(c[2] - c[3]))
+        share = c[0] if c[0] > 0.0 else 1.0
+        left = off**2 / (np.var(y) * len(v))
+        return Told(float(left), float(sign / share), float((c[2] - c[1]) / share))
 
 
 def _range(y: np.ndarray) -> float:

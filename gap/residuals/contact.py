@@ -175,7 +175,7 @@ def _trials(model, kind: str, at: str):
              for f in _INERTIAS],
             names, (),
         )  # fmt: skip
-    elif all(p.unit in _DRAGS for p in KINDS[kind].parameters):
+    elif KINDS[kind].body_law and all(p.unit in _DRAGS for p in KINDS[kind].parameters):
         mass = model.dynamics.now("object_mass", [at])["mass"]
         none = {p.name: 0.0 for p in KINDS[kind].parameters}
         for p in KINDS[kind].parameters:

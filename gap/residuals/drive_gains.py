@@ -19,7 +19,7 @@ KEY = "drive_gains"  # Of a scene's `tolerance`.
 # As masses of links: torque constants, and what loops at other rates make of a gain,
 # differ by that much, and long logs show a fraction of it.
 KNOWN_TO = 0.02
-_STEP = 0.01  # Of a gain, to see what it gives.
+_STEP = 1e-3  # Of a gain, to see what it gives.
 
 
 def gain_changes(
@@ -60,26 +60,29 @@ def with_moved_gains(scene: Scene, names: Sequence[str], values) -> Scene:
 
 def gain_columns(model) -> tuple[list[np.ndarray], list[float], list[str]]:
     """Columns (m,) of the residual of an InverseModel, standard deviations and names:
-    what each gain gives, per share of it."""
+    what each gain gives, per share of it.
+
+    Equations are in units of what drives are told (InverseModel.gains_with). Else with
+    gains and masses a tenth smaller all of an equation would be, and so would what no
+    effect explains, noise included: a fit would take that for a gain, and frictions
+    would come out as much too small.
+    """
     columns, prior, names = [], [], []
     share = gains_known_to(model.scene)
     joints = [j for j, told in zip(model.joints, model.commanded, strict=True) if told]
     for joint in joints if share else ():
         i = model.joints.index(joint)
         for name, effect, size in _changes(model.scene, joint, _STEP):
-            efforts = []
-            for track, motion in zip(model.tracks, model.motions(), strict=True):
-                less = np.zeros((*motion.v.shape, 1))
-                if "damping" in effect.parameters:
-                    less[:, i, 0] = effect.parameters["damping"] / size * motion.v[:, i]
-                    told = track.commands.get(f"{joint}.velocity_command")
-                    if told is not None:
-                        less[:, i, 0] -= model.laws[i].kd * track.mean_held(told, 0.0)
-                else:
-                    other = model.motion(track, [effect]).effort
-                    less[:, i, 0] = (motion.effort - other)[:, i] / size
-                efforts.append(less)
-            columns.append(model.columns_of(efforts)[:, 0])
+            column = (model.base() - model.residual([effect])) / size
+            if "damping" in effect.parameters and model.has["velocity_command"][i]:
+                given = []  # Of a gain, not of damping: what follows the command.
+                for track in model.tracks:
+                    told = track.commands[f"{joint}.velocity_command"]
+                    less = np.zeros((len(track.middle), len(model.joints), 1))
+                    less[:, i, 0] = model.laws[i].kd * track.mean_held(told, 0.0)
+                    given.append(less)
+                column = column - model.columns_of(given)[:, 0]
+            columns.append(column)
             prior.append(share)
             names.append(name)
     return columns, prior, names

@@ -86,11 +86,15 @@ class InverseModel(WhitenedRows):
         return self._with(mine) if mine else self.dynamics
 
     def gains_with(self, effects: Sequence[Effect]) -> np.ndarray:
-        """(n_joints,) of the drives, by which their equations are divided: a small gain
-        would make all that is left small, whatever it is."""
-        return np.array(
-            [max(path_of(effects, joint).gain, LEAST_GAIN) for joint in self.joints]
-        )
+        """(n_joints,) of the drives, over what the scene has, by which their equations
+        are divided: a small gain would make all that is left small, whatever it is."""
+        gains = np.ones(len(self.joints))
+        for i, (joint, law) in enumerate(zip(self.joints, self.laws, strict=True)):
+            path = path_of(effects, joint)
+            gains[i] = path.gain
+            if law is not None and law.kp > 0.0:
+                gains[i] *= float(law.with_kp(path.kp).kp / law.kp)
+        return np.maximum(gains, LEAST_GAIN)
 
     def motions(self) -> list[Motion]:
         """Of each track, as measured."""

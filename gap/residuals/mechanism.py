@@ -22,7 +22,7 @@ from makebreak.gap.problem import (
     share_left,
 )
 from makebreak.gap.residuals.drive_gains import KEY as GAINS
-from makebreak.gap.residuals.drive_gains import with_moved_gains
+from makebreak.gap.residuals.drive_gains import gain_name, with_moved_gains
 from makebreak.gap.residuals.inverse import InverseModel
 from makebreak.gap.residuals.mechanism_candidates import (
     candidates,
@@ -381,7 +381,7 @@ class MechanismProblem(InverseModel, GapProblem):
         entry = KINDS[effect.kind]
         return (
             entry.weighs
-            or entry.path == "gain"
+            or entry.path in ("gain", "kp")
             or (entry.before_finalize is not None and not entry.hidden_state)
         )
 
@@ -463,7 +463,23 @@ class MechanismProblem(InverseModel, GapProblem):
                 name: float(np.hypot(x, share * effect.parameters[name]))
                 for name, x in std.items()
             }
+        if share := self._gain_unknown(end, effect.at):
+            # In units of what the drive is told.
+            forces = [p.name for p in KINDS[effect.kind].parameters
+                      if p.unit.startswith("N") or p.unit == "kg m2"]  # fmt: skip
+            for name in std.keys() & forces:
+                std[name] = float(np.hypot(std[name], share * effect.parameters[name]))
         return std, or_more
+
+    def _gain_unknown(self, end: Fitted, joints: Sequence[str]) -> float:
+        """The share by which the gain of any of these joints' drives may be off."""
+        n = self.nuisances()
+        mine = [k for k, name in enumerate(n.names)
+                if any(name == gain_name(joint) for joint in joints)]  # fmt: skip
+        if not mine:
+            return 0.0
+        deviation = np.sqrt(np.diag(self._covariance_of(n)))
+        return float(np.hypot(end.b[mine], deviation[mine]).max())
 
     def candidates(self, nuisances: Nuisances, current: Fitted) -> list[Candidate]:
         if self._found is None:
@@ -743,9 +759,7 @@ class MechanismProblem(InverseModel, GapProblem):
     def _effort_of_nuisances(self, nuisances: Nuisances) -> dict[str, float]:
         """{joint: standard deviation of its effort [N m]} that is not known of the
         nuisances, after what the fitted rows say of them."""
-        N = nuisances.columns[self.train()]
-        known = N.T @ N + np.diag(1.0 / nuisances.prior**2)
-        root = np.linalg.cholesky(np.linalg.inv(known))
+        root = np.linalg.cholesky(self._covariance_of(nuisances))
         each = [self.in_units(column) for column in (nuisances.columns @ root).T]
         std = np.sqrt(np.sum(np.square(each), axis=0))
         return {
@@ -753,6 +767,11 @@ class MechanismProblem(InverseModel, GapProblem):
             for k, (what, joint) in enumerate(self.names())
             if what == "effort"
         }
+
+    def _covariance_of(self, nuisances: Nuisances) -> np.ndarray:
+        """(n_b, n_b) of the nuisances, after what the fitted rows say of them."""
+        N = nuisances.columns[self.train()]
+        return np.linalg.inv(N.T @ N + np.diag(1.0 / nuisances.prior**2))
 
 
 def beyond_noise(off: np.ndarray, noise: np.ndarray) -> float:
