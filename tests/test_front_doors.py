@@ -442,3 +442,33 @@ def test_a_reading_scaled_has_its_zero_in_the_new_unit():
         q * other.scale + other.zero, (q * reading.scale + reading.zero) * [1.0, 0.1]
     )
     assert other.order == reading.order
+
+
+def test_friction_tells_the_sign_of_an_effort_that_carries_nothing(tmp_path):
+    """It never drives. Beside it, what the model needs of the joint is next to none."""
+    path, log = exact("scara", tmp_path, np.random.default_rng(3))
+    v = log.truth["arm.joint4.velocity"]
+    friction = 40.0 * (np.tanh(v / 0.01) + 0.5 * v)
+    columns = {"time": log.time} | log.columns
+    for sign in (1.0, -1.0):
+        columns["joint4_effort"] = sign * (log.columns["joint4_effort"] + friction)
+        read = read_log(csv(tmp_path / f"log{sign:.0f}.csv", columns))
+        said = propose_scene(read_robot(path), [read]).findings()
+        turned = [f for f in said if f.kind == "effort_sign"]
+        assert [f.channel for f in turned] == (
+            [] if sign > 0.0 else ["arm.joint4.effort_measured"]
+        )
+
+
+def test_efforts_are_in_the_unit_that_most_of_them_are_in(tmp_path):
+    """One joint gives 12 % more than its model needs: a gain, for the search to find,
+    and no unit of its own."""
+    path, log = exact("three", tmp_path, np.random.default_rng(4))
+    columns = {"time": log.time} | log.columns
+    for k, gain in enumerate((1.0, 1.0, 1.12), start=1):
+        columns[f"joint{k}_effort"] = 1e3 * gain * columns[f"joint{k}_effort"]
+    read = read_log(csv(tmp_path / "log.csv", columns))
+    text = propose_scene(read_robot(path), [read]).sidecars[read.path]
+    for k in (1, 2, 3):
+        line = f"joint{k}_effort: {{channel: arm.joint{k}.effort_measured, scale: 0.001"
+        assert line in text

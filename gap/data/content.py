@@ -73,6 +73,9 @@ _UNSURE = (
     "larger than the model needs, several times, and no rotor would do: another unit, "
     "or a load or a spring that the model lacks; taken as it is"
 )
+_OTHER_SIGN = (
+    "of the other sign than the model needs (or its position and velocity are)"
+)
 _SEVERITY = {
     "no_content": "warning",
     "too_short": "info",
@@ -107,11 +110,12 @@ class Likeness:
 @dataclass(frozen=True)
 class Told:
     """effort = (what its joint needs - bias) / factor, with friction and a rotor's
-    inertia beside it, but for a share that is left."""
+    inertia beside it, but for a share that is left; other: by the other sign."""
 
     left: float
     factor: float
     bias: float
+    other: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -335,14 +339,13 @@ class Contents:
         one = np.ones_like(v)
         X = np.stack([needed, one, -one, v, np.sign(v), vd], axis=1)
         size = np.maximum(np.abs(X).max(axis=0), 1e-300)
-        c, off, sign = min(
-            ((*nnls(X / size, sign * y), sign) for sign in (1.0, -1.0)),
-            key=lambda each: each[1],
-        )
+        fits = [(*nnls(X / size, sign * y), sign) for sign in (1.0, -1.0)]
+        (c, off, sign), (_, more, _) = sorted(fits, key=lambda each: each[1])
         c = c / size
         share = c[0] if c[0] > 0.0 else 1.0
-        left = off**2 / (np.var(y) * len(v))
-        return Told(float(left), float(sign / share), float((c[2] - c[1]) / share))
+        left, other = (x**2 / (np.var(y) * len(v)) for x in (off, more))
+        bias = (c[2] - c[1]) / share
+        return Told(float(left), float(sign / share), float(bias), float(other))
 
 
 def _range(y: np.ndarray) -> float:
@@ -839,6 +842,14 @@ def _with_factors(contents: Contents, matches, said) -> list[Match]:
                                        std=abs(x.std / out[k].scale)))
             for i, (k, x) in found.items()
         })  # fmt: skip
+        for i, (k, x) in found.items():
+            # Where next to nothing is needed, friction tells the sign: it never drives.
+            told, own = contents.told(out[k].column, i), factors.get(i, (1.0, ""))
+            clear = x.explained < EXPLAINS and told.left < 1.0 - EXPLAINS
+            clear &= told.other > CLEARER * told.left
+            if clear and told.factor * out[k].scale * own[0] < 0.0:
+                words = "; ".join(filter(None, (own[1], _OTHER_SIGN)))
+                factors[i] = (-own[0], words)
         for i, (factor, word) in factors.items():
             k, _ = found[i]
             m = out[k]
@@ -988,7 +999,14 @@ def _one_factor(each: Sequence[Likeness]) -> tuple[float, float]:
     middle = float(np.average(factors, weights=stds**-2.0))
     within = float(max(ALIKE / 6.0 * abs(middle), np.sum(stds**-2.0) ** -0.5))
     room = np.maximum(ALIKE * abs(middle), SIGMAS * stds)
-    return middle, within if (np.abs(factors - middle) < room).all() else 0.0
+    if (np.abs(factors - middle) < room).all():
+        return middle, within
+    for unit, _ in _UNITS:  # What most are in, others are, but for a gain.
+        share = np.abs(factors) / unit
+        most = 2 * int((np.abs(share - 1.0) < ALIKE).sum()) >= max(len(share), 3)
+        if most and ((share > GAINS[0]) & (share < GAINS[1])).all():
+            return float(np.sign(np.median(factors))) * unit, ALIKE / 6.0 * unit
+    return middle, 0.0
 
 
 def _not_a_rotor(contents: Contents, name: str, i: int, factor: float) -> bool:
@@ -1004,9 +1022,8 @@ def _not_a_rotor(contents: Contents, name: str, i: int, factor: float) -> bool:
 def _in_words(factor: float, std: float) -> tuple[float, str]:
     """A factor, as round as it may be, and what it looks like."""
     size, sign = abs(factor), float(np.sign(factor))
-    other = "of the other sign than the model needs (or its position and velocity are)"
     if GAINS[0] < size < GAINS[1]:
-        return sign, other
+        return sign, _OTHER_SIGN
     word = ""
     for unit, name in _UNITS:
         if abs(size / unit - 1.0) < ALIKE:
@@ -1018,7 +1035,7 @@ def _in_words(factor: float, std: float) -> tuple[float, str]:
             f"{ratio:.3g} times {'smaller' if size > 1.0 else 'larger'} than the model "
             "needs, as on the motor's side of a gear, in amperes or in another unit"
         )
-    return sign * size, word + (f", and {other}" if sign < 0.0 else "")
+    return sign * size, word + (f", and {_OTHER_SIGN}" if sign < 0.0 else "")
 
 
 def _round(x: float, within: float) -> float:
