@@ -95,9 +95,7 @@ def test_the_steps_follow_drakes_continuous_plant_through_an_impact(scene):
     np.testing.assert_allclose(got[:, :4], want[:, :4], atol=3e-4)
 
 
-def test_drag_with_the_square_of_the_speed_lets_a_body_fall_no_faster_than_its_end_speed(
-    scene,
-):
+def test_drag_with_the_square_of_the_speed_ends_in_a_steady_fall(scene):
     # From rest v = -u tanh(g t/u), z = -(u2/g) ln cosh(g t/u); u2 = m g/c.
     body = FreeBodyScene(scene).body(
         [Effect("body_quadratic_drag", ["cube.cube"], {"coefficient": 0.05})]

@@ -425,6 +425,9 @@ class Steps:
     def apart(self, effects, names):
         return []
 
+    def moved_by(self, effect):
+        return np.ones(8, bool)
+
     def replaced(self, effects):
         return None
 

@@ -110,12 +110,14 @@ class Likeness:
 @dataclass(frozen=True)
 class Told:
     """effort = (what its joint needs - bias) / factor, with friction and a rotor's
-    inertia beside it, but for a share that is left; other: by the other sign."""
+    inertia beside it, but for a share that is left; other: by the other sign; rubs: the
+    share of friction in it."""
 
     left: float
     factor: float
     bias: float
     other: float = 1.0
+    rubs: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -345,7 +347,8 @@ class Contents:
         share = c[0] if c[0] > 0.0 else 1.0
         left, other = (x**2 / (np.var(y) * len(v)) for x in (off, more))
         bias = (c[2] - c[1]) / share
-        return Told(float(left), float(sign / share), float(bias), float(other))
+        rubs = float(np.var(X[:, 3:5] @ c[3:5]) / np.var(y))
+        return Told(float(left), float(sign / share), float(bias), float(other), rubs)
 
 
 def _range(y: np.ndarray) -> float:
@@ -846,7 +849,7 @@ def _with_factors(contents: Contents, matches, said) -> list[Match]:
             # Where next to nothing is needed, friction tells the sign: it never drives.
             told, own = contents.told(out[k].column, i), factors.get(i, (1.0, ""))
             clear = x.explained < EXPLAINS and told.left < 1.0 - EXPLAINS
-            clear &= told.other > CLEARER * told.left
+            clear &= told.other > CLEARER * told.left and told.rubs > NOTHING
             if clear and told.factor * out[k].scale * own[0] < 0.0:
                 words = "; ".join(filter(None, (own[1], _OTHER_SIGN)))
                 factors[i] = (-own[0], words)

@@ -39,6 +39,7 @@ def drag_law(V, t, p, F):
 
 @numba.njit(cache=True)
 def quadratic_drag_law(V, t, p, F):
+    """-c |v| v on the origin, [N]; p: c [N s2/m2]."""
     speed = math.sqrt(V[3] ** 2 + V[4] ** 2 + V[5] ** 2)
     for i in range(3):
         F[3 + i] -= p[0] * speed * V[3 + i]
