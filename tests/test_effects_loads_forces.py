@@ -23,7 +23,7 @@ from scipy.integrate import solve_ivp
 from makebreak.gap.simulation.commands import Commands
 from makebreak.gap.simulation.scene_simulation import SceneSimulation
 from makebreak.models.dynamics import SceneDynamics
-from makebreak.models.scene import load_scene
+from makebreak.models.scene import load_scene, read_scene
 
 TIMES = np.linspace(0.0, 1.0, 11)
 CHANNELS = ["p.j1.position", "p.j1.velocity"]
@@ -108,6 +108,33 @@ def test_a_load_that_is_not_there_is_a_negative_point_mass(tmp_path, time_step, 
     loaded = load_scene(scene, DiagramBuilder())
     assert loaded.plant.CalcTotalMass(loaded.plant.CreateDefaultContext()) == 0.7
     assert SceneDynamics(scene).least("payload", ["p.rod"]) == {"mass": -0.7}
+
+
+@pytest.mark.parametrize(
+    "inertial",
+    ["", "<inertial><mass>2</mass></inertial>",
+     "<inertial><inertia><ixx>0.9</ixx></inertia></inertial>"],
+)  # fmt: skip
+def test_what_an_sdf_leaves_out_of_an_inertia_is_as_drake_has_it(tmp_path, inertial):
+    (tmp_path / "m.sdf").write_text(
+        '<sdf version="1.9"><model name="m"><link name="l">'
+        f"{inertial}</link></model></sdf>"
+    )
+    (tmp_path / "scene.yaml").write_text(
+        f"directives:\n  - add_model: {{name: m, file: {tmp_path / 'm.sdf'}}}\n"
+    )
+    scene = read_scene(tmp_path / "scene.yaml")
+    rows = []
+    for added in ([], [("link_mass", "m.l", {"mass": 0.5})]):
+        plant = load_scene(with_effects(scene, *added), DiagramBuilder()).plant
+        own = plant.GetBodyByName("l").CalcSpatialInertiaInBodyFrame(
+            plant.CreateDefaultContext()
+        )
+        about = own.CalcRotationalInertia().CopyToFullMatrix3()
+        rows.append(np.r_[own.get_mass(), np.diag(about)])
+    mass = rows[0][0]  # Moments go with the mass.
+    more = np.r_[0.5 / mass, np.full(3, 0.5 / mass)]
+    np.testing.assert_allclose(rows[1], (1.0 + more) * rows[0])
 
 
 def heavier(mass):

@@ -6,6 +6,7 @@ Of an MJCF file, which is as mjcf.py writes it, only inertias can be edited.
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from xml.dom import expatbuilder, minidom
 
 import numpy as np
@@ -199,12 +200,30 @@ MOMENTS = {"xx": (0, 0), "yy": (1, 1), "zz": (2, 2)}
 PRODUCTS = {"xy": (0, 1), "xz": (0, 2), "yz": (1, 2)}
 
 
+def _state_sdf_defaults(link: minidom.Element) -> None:
+    """Writes down what an SDF file leaves out: 1 kg, moments of 1 kg m2."""
+    document: Any = link.ownerDocument
+    if document.documentElement.tagName != "sdf":
+        return
+    ones = {f"i{key}": "1" for key in MOMENTS}
+    for parents, tags in (
+        ((), {"inertial": ""}),
+        (("inertial",), {"mass": "1", "inertia": ""}),
+        (("inertial", "inertia"), ones),
+    ):
+        parent = children(link, *parents)[0] if parents else link
+        for tag, value in tags.items():
+            if not children(parent, tag):
+                set_text(parent.appendChild(_element(document, tag)), value)
+
+
 def read_inertial(link: minidom.Element) -> Inertial:
-    """The inertia of a link element.
+    """The inertia of a link element; what SDF has for want of one is written into it.
 
     Raises: ValueError if mass or inertia is missing, or if the inertial pose has
         attributes other than its six numbers in radians.
     """
+    _state_sdf_defaults(link)
     name = link.getAttribute("name")
     inertia = children(link, "inertial", "inertia")
     mass = children(link, "inertial", "mass")
