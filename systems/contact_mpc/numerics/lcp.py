@@ -19,7 +19,8 @@ from makebreak.systems.contact_mpc.numerics.nearest_point import nearest_mode
 
 # Modes that the search behind Lemke's method looks at.
 NODES_MAX = 2000
-# Pivots after which the second try of Lemke's method computes its tableau anew.
+# Pivots after which later tries of Lemke's method compute their tableau anew; the last
+# one does after each.
 REBUILD = 10
 # Largest force z, in units in which diag(M) and max |b| are 1, that counts as the scale
 # of a rounding error; larger ones are no excuse for a breach of w >= 0.
@@ -46,7 +47,8 @@ def solve_lcp(F, q):
 
     Source: see the module; the method costs about n pivots of n x 2n numbers.
     """
-    F, q = np.ascontiguousarray(F, dtype=float), np.ascontiguousarray(q, dtype=float)
+    # Copies that can be written to; for others all would be compiled once more.
+    F, q = np.array(F, dtype=float, order="C"), np.array(q, dtype=float)
     if q.ndim != 1 or F.shape != (q.size, q.size):
         raise ValueError(
             f"solve_lcp: F is {F.shape} and q is {q.shape}, expected (n, n) and (n,)"
@@ -102,6 +104,7 @@ def solve_lcp_kernel(F, q):
         (1e-11, REBUILD, 1.0),
         (1e-9, REBUILD, 1.0),
         (1e-13, REBUILD, 1.0),
+        (1e-11, 1, 1.0),
     ):
         z, status = _lemke(M, b / unit, tolerance, rebuild)
         if status == SOLVED:
