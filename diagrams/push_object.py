@@ -632,9 +632,11 @@ def _add_records(
         for i in plant.GetBodyIndices(plant.GetModelInstanceByName(name))
     ]
     load = builder.AddNamedSystem(
-        "contact_load", ContactLoad(arm_bodies, plant.GetBodyByName(OBJECT))
+        "contact_load",
+        ContactLoad(arm_bodies, plant.GetBodyByName(OBJECT), tau.size()),
     )
     wiring.connect(builder, station, "contact_results", load, "contact_results")
+    wiring.connect(builder, station, f"{ARM}.contact_torque", load, "contact_torque")
     for name, source, period in (
         ("torque_log", tau, ARM_TICK),
         ("load_log", load.get_output_port(), ARM_TICK),

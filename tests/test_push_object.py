@@ -350,8 +350,9 @@ def test_a_lying_cylinder_is_followed_and_a_t_is_not():
 # The forces.
 
 
-def load_on(names, other):
-    """ContactLoad on bodies of a stack of boxes of 1, 2 and 4 kg, at rest."""
+def load_on(names, other, torque=None):
+    """ContactLoad on bodies of a stack of boxes of 1, 2 and 4 kg, at rest. Args:
+    torque: of the contacts on the bodies' joints, as the load is told."""
     builder = DiagramBuilder()
     plant, _ = AddMultibodyPlantSceneGraph(builder, 1e-3)
     hard = CoulombFriction(1.0, 1.0)
@@ -369,10 +370,13 @@ def load_on(names, other):
         )
     plant.Finalize()
     bodies = [plant.GetBodyByName(name) for name in names]
-    load = builder.AddSystem(ContactLoad(bodies, plant.GetBodyByName(other)))
+    load = builder.AddSystem(ContactLoad(bodies, plant.GetBodyByName(other), 1))
     builder.Connect(
         plant.get_contact_results_output_port(), load.GetInputPort("contact_results")
     )
+    if torque is not None:
+        told = builder.AddSystem(ConstantVectorSource([torque]))
+        builder.Connect(told.get_output_port(), load.GetInputPort("contact_torque"))
     simulator = Simulator(builder.Build())
     own = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     plant.SetPositions(own, [0.05, 0.15, 0.25])
@@ -392,6 +396,12 @@ def test_all_contacts_of_some_bodies_count_and_none_among_themselves():
         load_on(["box0", "box1"], "box2"), [4.0 * 9.81, 7.0 * 9.81], rtol=1e-3
     )
     np.testing.assert_allclose(load_on(["box2"], "box0"), [0.0, 4.0 * 9.81], rtol=1e-3)
+
+
+def test_contacts_are_read_only_where_their_torque_says_that_there_is_one():
+    np.testing.assert_array_equal(load_on(["box2"], "box0", 0.0), [0.0, 0.0])
+    touched = load_on(["box2"], "box0", -1e-9)
+    np.testing.assert_allclose(touched, [0.0, 4.0 * 9.81], rtol=1e-3)
 
 
 # The diagram.

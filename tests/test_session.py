@@ -17,6 +17,7 @@ from pydrake.geometry import Box, Meshcat, MeshcatVisualizer
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.multibody.tree import SpatialInertia
+from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource, Integrator
 
@@ -165,6 +166,26 @@ def test_a_system_that_others_keep_waiting_is_not_called_too_slow(tmp_path):
     assert waiting["p50_ms"] >= 3.0 and waiting["overruns"] == waiting["updates"]
     assert waiting["cpu_p99_ms"] < 2.0
     assert own.too_slow() == []
+
+
+class Quick(LeafSystem):
+    """Does nothing, 100000 times a second."""
+
+    def __init__(self):
+        super().__init__()
+        self.DeclarePeriodicDiscreteUpdateEvent(1e-5, 0.0, self._update)
+
+    @timed
+    def _update(self, context, discrete_state):
+        pass
+
+
+def test_of_the_updates_in_5_ms_one_is_asked_for_its_cpu_time():
+    system = Quick()
+    Simulator(system).AdvanceTo(0.01)
+    assert len(system.compute_sec) > 900
+    assert 1 <= len(system.compute_cpu_sec) < 500
+    assert min(system.compute_cpu_sec) >= 0.0
 
 
 class Ticker(LeafSystem):

@@ -56,14 +56,18 @@ class ContactLoad(LeafSystem):
     its tool (point contact). Opposing forces do not cancel; contacts among the bodies
     themselves are ignored.
 
-    Inputs:  contact_results (abstract).
+    Inputs:  contact_results (abstract); contact_torque (n,), optional: of all contacts
+             on the bodies' joints [N m]. Where it is zero, contact results are not read
+             (Drake copies them all), so contacts of what no joint moves, such as an
+             arm's base, count only beside others.
     Outputs: load (2,): from the body `other`, and from everything else [N].
 
-    Args: bodies; other: the body whose contacts are summed separately.
+    Args: bodies; other: the body whose contacts are summed separately; size: n.
     """
 
-    def __init__(self, bodies: Iterable[RigidBody], other: RigidBody):
+    def __init__(self, bodies: Iterable[RigidBody], other: RigidBody, size: int = 0):
         super().__init__()
+        self._torque = self.DeclareVectorInputPort("contact_torque", size)
         self._bodies = frozenset(int(body.index()) for body in bodies)
         self._other = int(other.index())
         self._results = self.DeclareAbstractInputPort(
@@ -73,6 +77,9 @@ class ContactLoad(LeafSystem):
 
     def _calc(self, context: Context, output: BasicVector):
         load = np.zeros(2)
+        if self._torque.HasValue(context) and not self._torque.Eval(context).any():
+            output.SetFromVector(load)
+            return
         results = self._results.Eval(context)
         for i in range(results.num_point_pair_contacts()):
             contact = results.point_pair_contact_info(i)

@@ -48,6 +48,9 @@ class UntouchedBall:
     v_since: np.ndarray = _zeros(2)  # The velocity then [m/s],
     v_until: np.ndarray | None = None  # and at its end; None: it is not over.
 
+    def __deepcopy__(self, _):  # Drake copies all state ten times in a period.
+        return self
+
 
 def watched(
     ball: UntouchedBall, t: float, v, pushed: bool, seen: bool
