@@ -242,8 +242,9 @@ def dialect_of(
             if name.count(".") > 1 or not name:  # As a channel's.
                 raise ValueError(f'recording {path}: column "{name}" is there twice')
             names[k] = name + " (again)" * names[:k].count(name)
-    stamped = any(each.search(header + sample) for each in (_STAMP, _CLOCK, _IN_SI))
-    lines = _in_seconds(sample).decode(errors="replace").splitlines()[:50]
+    seconds = _in_seconds(sample)
+    stamped = seconds != sample or _in_seconds(header) != header
+    lines = seconds.decode(errors="replace").splitlines()[:50]
     lists: dict[str, int] = {}
     if re.search(r"[\[(]", "".join(lines)):
         for cells in csv.reader(lines[:-1] or lines, delimiter=separator):
@@ -284,9 +285,12 @@ def _in_seconds(text: bytes) -> bytes:
         whole += int(rest)
         return b"%d.%s" % (whole, fraction or b"0")
 
-    return _IN_SI.sub(
-        rb"\1", _CLOCK.sub(of_day, _DAY.sub(b"", _STAMP.sub(seconds, text)))
-    )
+    # Most texts have neither, and are long.
+    if b":" in text:
+        text = _CLOCK.sub(of_day, _DAY.sub(b"", _STAMP.sub(seconds, text)))
+    if any(letter in text for letter in (b"s", b"d", b"m", b"N")):
+        text = _IN_SI.sub(rb"\1", text)
+    return text
 
 
 def is_nameless(column: str) -> bool:

@@ -12,8 +12,6 @@ import sys
 import tempfile
 from pathlib import Path
 
-import joblib
-
 from makebreak.scripts.experiments import load_experiment
 from makebreak.scripts.runner.parent import end_with_parent
 from makebreak.scripts.runner.session import Session
@@ -23,6 +21,8 @@ from makebreak.scripts.runner.trials import run_environment
 
 def start(experiment: str, config_file: Path) -> None:
     """Starts the second process, which ends with this one, if there are two cores."""
+    import joblib  # Here, as it takes long to import.
+
     if joblib.cpu_count() > 1:
         subprocess.Popen(
             [sys.executable, "-m", __spec__.name, experiment, str(config_file)],

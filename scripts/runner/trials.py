@@ -19,7 +19,6 @@ from functools import partial
 from hashlib import sha256
 from pathlib import Path
 
-import joblib
 from tqdm import tqdm
 
 import makebreak
@@ -199,7 +198,7 @@ def run_commands(
             ) as bar,
             _workers(cluster, jobs) as parallel,
         ):
-            waiting = []
+            waiting: list[tuple] = []
             for i, (command, folder) in enumerate(zip(commands, folders, strict=True)):
                 if is_done(i):
                     results[i] = _read(folder, 0)
@@ -212,7 +211,7 @@ def run_commands(
                 else:
                     far = _portable(command, folder)
                     task = partial(_run_far, i, far, limit_sec)
-                waiting.append(joblib.delayed(task)())
+                waiting.append((task, (), {}))  # As joblib.delayed has it.
             for i, status, files in parallel(waiting):
                 for name, content in files.items():
                     (folders[i] / name).write_bytes(content)
@@ -317,6 +316,8 @@ def _workers(cluster: str | None, jobs: int):
 
     Raises: ValueError if the cluster or its library is not available.
     """
+    import joblib  # Here, as it takes long to import.
+
     now = dict(return_as="generator_unordered", batch_size=1)
     if cluster is None:
         # Threads suffice, as they only wait for processes.
