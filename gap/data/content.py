@@ -519,7 +519,7 @@ def _all_ordered(contents: Contents, matches, said) -> list[Match]:
     if len(efforts) < n or n > MOST_ORDERED:
         return matches
     before = _misfit(contents, efforts)
-    if before < np.log(1.0 - EXPLAINS):
+    if before < np.log(TOLD_WELL):
         return matches
     few = contents.fewer(FEW)
 
