@@ -16,6 +16,9 @@ AT_BOUND = 1e-9  # A parameter that may not be negative is zero.
 # do not change by this share of the noise without it.
 HARDLY, UNSEEN = 1e-3, 1e-3
 SHORT = 8  # Evaluations: a fit of no more is not asked to converge.
+# Of what a step changed, what slopes may have missed: to be kept, and to be as good as
+# exact; and of all that is left, what is nothing.
+BENT, STRAIGHT, NOTHING = 0.1, 1e-3, 1e-6
 # Of a parameter's size: first steps of a search without slopes, and how far around one
 # looks where that ended.
 WANDER, AROUND = 0.2, 0.5
@@ -62,35 +65,12 @@ def fit_effects(
         rows = np.append(rows, problem.prior_rows(free.effects(z)))
         return np.where(np.isfinite(rows), rows, 1e6)
 
-    sets = problem.apart(start, free.names) or [[k] for k in range(len(x0))]
-    masks = [problem.moved_by(start[i]) for i, _ in free.names]
-
-    def slopes(z) -> np.ndarray:
-        """(n, k) of the cost's rows, of sets of parameters at once; to the other side
-        where a model cannot have what is on one."""
-        r, rows = residual(z), cost(z)
-        J = np.zeros((len(rows), len(z)))
-        h = problem.plan.diff_step * np.maximum(np.abs(z), 0.3)
-        h = np.where(z + h > free.high / scale, -h, h)
-        for some in sets:
-            for step in (h, -h):
-                moved = np.array(z)
-                moved[some] += step[some]
-                try:
-                    off = residual(moved) - r
-                except (ValueError, RuntimeError):
-                    continue
-                for k in some:
-                    there = screen.cost_rows(r + np.where(masks[k], off, 0.0))
-                    J[: len(there), k] = (there - rows[: len(there)]) / step[k]
-                break
-        return J
-
-    solved = least_squares(
-        cost, x0 / scale, slopes, bounds=(low / scale, free.high / scale),
-        x_scale=1.0, xtol=1e-6,
-        ftol=1e-6 if steps > SHORT else 1e-4, max_nfev=steps,
-    ) if len(x0) else None  # fmt: skip
+    slopes = _Slopes(problem, free, residual, cost, screen.cost_rows)
+    solved = None
+    if len(x0):
+        solved = _solved(
+            cost, slopes, x0 / scale, (low / scale, free.high / scale), steps
+        )
     z = x0 / scale if solved is None else solved.x
     if solved is not None:  # What does not show is not told: it stays neutral.
         shows = np.linalg.norm(solved.jac, axis=0)
@@ -133,6 +113,96 @@ def fit_effects(
         J, np.array(solved.fun) if solved is not None else np.zeros(0),
         tuple(free.names),
     )  # fmt: skip
+
+
+def _solved(cost: Callable, slopes: "_Slopes", z, bounds, steps: int):
+    """scipy's least squares, of which the last slopes are exact."""
+    while True:
+        slopes.renew()
+        solved = least_squares(
+            cost, z, slopes, bounds=bounds, x_scale=1.0, xtol=1e-6,
+            ftol=1e-6 if steps > SHORT else 1e-4, max_nfev=max(steps, 1),
+        )  # fmt: skip
+        steps -= solved.nfev
+        if slopes.are_exact:
+            return solved
+        z = solved.x
+
+
+class _Slopes:
+    """Of the rows that a fit minimises, with respect to its parameters: differences,
+    taken anew where what the last step did is not what they said, else corrected by it.
+
+    Source: Broyden, Math. Comp. 19(92), 1965, method 1.
+    """
+
+    def __init__(
+        self, problem: GapProblem, free: "_Free", residual, cost, rows_of: Callable
+    ):
+        self._problem, self._free = problem, free
+        self._residual, self._cost, self._rows_of = residual, cost, rows_of
+        alone = [[k] for k in range(len(free.names))]
+        self._sets = problem.apart(free.start, free.names) or alone
+        every = np.ones(1, bool)
+        self._mine = [
+            every if self._sets is alone else problem.moved_by(free.start[i])
+            for i, _ in free.names
+        ]
+        self._last: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+        self.are_exact = False
+
+    def renew(self) -> None:
+        """The next are differences."""
+        self._last = None
+
+    def __call__(self, z: np.ndarray) -> np.ndarray:
+        """(n, k) at parameters z (k,)."""
+        rows = self._cost(z)
+        if self._last is not None:
+            there, were, J = self._last
+            step = z - there
+            off = rows - were - J @ step
+            missed, change, size = map(np.linalg.norm, (off, rows - were, rows))
+            if missed <= max(BENT * change, NOTHING * size):
+                if missed > NOTHING * size:
+                    J = J + np.outer(off, step) / (step @ step)
+                    self.are_exact &= bool(missed <= STRAIGHT * change)
+                self._last = z.copy(), rows, J
+                return J
+        J = self._differences(z, rows)
+        self._last, self.are_exact = (z.copy(), rows, J), True
+        return J
+
+    def _differences(self, z: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        problem, free = self._problem, self._free
+        r, J = self._residual(z), np.zeros((len(rows), len(z)))
+        for some in self._sets:
+            off, h = self._moved(z, some, r)
+            if off is None:
+                continue
+            for k in some:
+                alone = np.array(z)
+                alone[k] += h[k]
+                there = np.append(
+                    self._rows_of(r + np.where(self._mine[k], off, 0.0)),
+                    problem.prior_rows(free.effects(alone)),
+                )
+                J[:, k] = (there - rows) / h[k]
+        return np.where(np.isfinite(J), J, 0.0)
+
+    def _moved(self, z: np.ndarray, some: Sequence[int], r: np.ndarray):
+        """(m,) what steps h (k,) of some parameters do, backwards where a step is
+        refused (None: both are), and h."""
+        h = self._problem.plan.diff_step * np.maximum(np.abs(z), 0.3)
+        h = np.where(z + h > self._free.high / self._free.scale, -h, h)
+        for side in (1.0, -1.0):
+            moved = np.array(z)
+            moved[some] += side * h[some]
+            try:
+                return self._residual(moved) - r, side * h
+            except (ValueError, RuntimeError):
+                continue
+        return None, h
 
 
 def _unidentified(parameter: Parameter, start: float) -> float:
@@ -231,7 +301,7 @@ class _Free:
         start: Sequence[Effect],
         fixed: Sequence[Sequence[str]],
     ):
-        self._start = start
+        self.start = start
         self.names = [
             (i, name)
             for i, effect in enumerate(start)
@@ -256,14 +326,14 @@ class _Free:
 
     def effects(self, z: np.ndarray) -> list[Effect]:
         """Effects of parameters z (n,), in units of `scale`."""
-        parameters = [dict(effect.parameters) for effect in self._start]
+        parameters = [dict(effect.parameters) for effect in self.start]
         # A number that is refused is not where a fit ends, which may not see it at all.
         values = np.clip(z * self.scale, -self._most, self._most)
         for (i, name), value in zip(self.names, values, strict=True):
             parameters[i][name] = float(value)
         return [
             Effect(e.kind, list(e.at), p)
-            for e, p in zip(self._start, parameters, strict=True)
+            for e, p in zip(self.start, parameters, strict=True)
         ]
 
 

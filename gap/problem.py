@@ -21,6 +21,7 @@ from makebreak.models.effects.kind import Effect, check_parameters
 from makebreak.models.scene import Scene
 
 DISTANCES = "distances"  # A channel is judged by these alone: not its motion.
+FEWEST_BLOCKS = 4  # Of time, of which one may be left out.
 BEYOND = 1.5  # Times what a model can lose at most is taken for all of it.
 
 
@@ -401,6 +402,18 @@ class GapProblem(ABC):
     def error(self, fitted: Fitted) -> float:
         """What the verdict goes by: held-out error in units of the noise."""
         return fitted.score
+
+    def steady_error(self, fitted: Fitted) -> float:
+        """Held-out error over the noise without the block of time that leaves most;
+        of few blocks, with it."""
+        held = ~self.train()
+        square = self.in_noise(fitted.left)[held] ** 2
+        _, block = np.unique(self.blocks()[held], return_inverse=True)
+        sums, counts = np.bincount(block, square), np.bincount(block)
+        if len(sums) < FEWEST_BLOCKS:
+            return self.error(fitted)
+        k = int(np.argmax(sums))
+        return float(np.sqrt((sums.sum() - sums[k]) / (counts.sum() - counts[k])))
 
     def closed(self, start: Fitted, end: Fitted) -> float:
         """Share of the gap, beyond the noise, that the effects of `end` close where

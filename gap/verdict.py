@@ -73,8 +73,9 @@ class Facts:
     whether agreement needs simulated windows. turned: that another direction of gravity
     explains as much, as a sentence. unjudged: what was measured and not compared, as a
     sentence. found_before: whether an effect was taken off the recordings beforehand.
-    below: held-out error with effects, too, that move simulated windows less than the
-    scene's own time step does.
+    steady: `start` without the block of time that leaves most: no single stretch
+    decides. below: held-out error with effects, too, that move simulated windows less
+    than the scene's own time step does.
     """
 
     choices: Sequence[Choice]
@@ -89,6 +90,7 @@ class Facts:
     turned: str = ""
     unjudged: str = ""
     found_before: bool = False
+    steady: float = float("inf")
     below: float = float("inf")
 
 
@@ -117,7 +119,7 @@ def _closed_in_simulation(f: Facts) -> bool:
 
 def _agree_in_simulation(f: Facts) -> bool:
     """Simulated windows show nothing, and the equations hardly more than smoothing."""
-    return f.start <= UNEXPLAINED_RMS and 0.0 < _before(f.chosen_on) <= NOISE_RMS_MAX
+    return f.steady <= UNEXPLAINED_RMS and 0.0 < _before(f.chosen_on) <= NOISE_RMS_MAX
 
 
 def _not_simulated(f: Facts) -> bool:

@@ -520,6 +520,7 @@ def conclude(
         return Facts(
             some.choices, problem.error(some.start), problem.error(some.end), some.far,
             outcome.gap if outcome else None, below=below,
+            steady=problem.steady_error(some.start),
             loud=("", 0.0) if np.isfinite(below) else problem.loudest(some.start),
             loud_max=problem.plan.loud, asks_simulation=problem.plan.simulation_agrees,
         )  # fmt: skip

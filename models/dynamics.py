@@ -34,8 +34,17 @@ from makebreak.models.effects.kind import (
     one_dof_joints,
 )
 from makebreak.models.effects.signature import Grid, Motion, Signature
-from makebreak.models.scene import LoadedScene, Scene, load_scene, read_scene
+from makebreak.models.joint_tree import NoJointTree, carrier, joint_tree
+from makebreak.models.scene import (
+    LoadedScene,
+    Scene,
+    joint_laws,
+    load_scene,
+    read_scene,
+)
 from makebreak.models.scene_schema import COMMANDS_OF
+from makebreak.systems.numerics import joint_tree as tree_dynamics
+from makebreak.systems.numerics.joint_tree import JointTree
 
 SLOPE_STEPS = (1e-4, 0.05)  # Of positions and velocities, for slopes of accelerations.
 
@@ -62,6 +71,11 @@ class SceneDynamics:
         self._context = self.plant.CreateDefaultContext()
         self._forces = MultibodyForces(self.plant)
         self._joint_numbers, self._body_laws = _laws(self.loaded)
+        try:  # Compiled: some ten times as fast.
+            self._tree: JointTree | None = joint_tree(self.plant)
+        except NoJointTree:
+            self._tree = None
+        self._carriers: dict = {}
         self._coordinates = _coordinates(self.plant)
 
     # ----- The model
@@ -69,6 +83,9 @@ class SceneDynamics:
     def inverse_dynamics(self, q, v, vd, time=None) -> np.ndarray:
         """Effort (n, n_v) for the motion q (n, n_q), v, vd (n, n_v) at the times (n,)
         [s], which are only needed for time-dependent forces."""
+        if self._tree is not None and not self._body_laws:
+            laws = joint_laws(self.loaded.effects, self.plant)
+            return tree_dynamics.inverse_dynamics(self._tree, q, v, vd, laws, time)
         plant, context, forces = self.plant, self._context, self._forces
         n = len(v)
         time = np.zeros(n) if time is None else time
@@ -89,6 +106,8 @@ class SceneDynamics:
 
     def momentum(self, q, v) -> np.ndarray:
         """M(q) v, (n, n_v) [kg m2/s] or [kg m/s]."""
+        if self._tree is not None:
+            return tree_dynamics.momentum(self._tree, q, v)
         out = np.empty_like(v)
         for k in range(len(v)):
             self.plant.SetPositions(self._context, q[k])
@@ -135,6 +154,12 @@ class SceneDynamics:
         """Motion of a body's origin in the world, rotation first: Jacobian (n, 6, n_v),
         velocity (n, 6), acceleration (n, 6); and the body's rotation (n, 3, 3)."""
         plant, context, W = self.plant, self._context, self.plant.world_frame()
+        if self._tree is not None:
+            index = body.index()
+            if index not in self._carriers:
+                self._carriers[index] = carrier(plant, body)
+            link, p_L, R_L = self._carriers[index]
+            return tree_dynamics.point_motion(self._tree, link, p_L, R_L, q, v, vd)
         n, n_v = len(v), plant.num_velocities()
         J, V, A = np.empty((n, 6, n_v)), np.empty((n, 6)), np.empty((n, 6))
         R = np.empty((n, 3, 3))
@@ -166,6 +191,8 @@ class SceneDynamics:
     def shifted(self, q, dq, step: float) -> np.ndarray:
         """q (n, n_q) moved by step times the velocities dq (n, n_v)."""
         out = np.array(q, dtype=float)
+        if self._tree is not None:
+            return out + step * np.asarray(dq)
         for k in range(len(out)):
             self.plant.SetPositions(self._context, q[k])
             out[k] += step * self.plant.MapVelocityToQDot(self._context, dq[k])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from effect_scenes import at_rest_but, double, pendulum, with_effects
 
-from makebreak.gap.numerics.driven_arm import mass_and_bias, rollout
+from makebreak.gap.numerics.driven_arm import rollout
 from makebreak.gap.simulation import driven_arm
 from makebreak.gap.simulation.commands import Commands
 from makebreak.gap.simulation.driven_arm import (
@@ -19,6 +19,7 @@ from makebreak.models.effects import KINDS
 from makebreak.models.scene import ActuationSection
 from makebreak.models.scene_schema import SupplySection
 from makebreak.systems.numerics.joint_laws import LAWS, law_number
+from makebreak.systems.numerics.joint_tree import mass_and_bias
 
 ROBOT = """<?xml version="1.0"?>
 <robot name="t"><link name="base"/>
@@ -157,7 +158,7 @@ def test_mass_matrix_and_bias_are_those_of_drake(tmp_path):
         plant.SetPositions(context, q)
         plant.SetVelocities(context, v)
         M, bias = np.empty((4, 4)), np.empty(4)
-        mass_and_bias(arm, q, v, M, bias)
+        mass_and_bias(arm.tree, q, v, M, bias)
         gravity = plant.CalcGravityGeneralizedForces(context)
         np.testing.assert_allclose(M, plant.CalcMassMatrix(context), atol=1e-12)
         np.testing.assert_allclose(
@@ -184,7 +185,9 @@ def test_what_takes_drakes_own_steps_is_refused(tmp_path):
 def test_what_cannot_be_stepped_ends_in_nan(tmp_path):
     scene, _ = tree(tmp_path)
     arm = DrivenArmScene(with_effects(scene, *ROTORS)).arm(())
-    light = arm._replace(mass=-arm.mass)  # No motion has this.
+    light = arm._replace(
+        tree=arm.tree._replace(mass=-arm.tree.mass)
+    )  # No motion has this.
     y = rollout(light, np.zeros(4), np.zeros(4), [0.0, 0.1], np.zeros((1, 2, 4)))
     assert np.isnan(y).all()
 

@@ -609,7 +609,9 @@ def test_what_a_tool_s_motion_adds_to_its_sensor_is_what_its_mount_carries():
         force = -R @ felt.translational() - weight
         moment = -R @ felt.rotational() - np.cross(p - at, R @ felt.translational())
         expected.append([*force, *(moment - np.cross(com - at, weight))])
-    own = SimpleNamespace(plant=plant, _context=plant.CreateDefaultContext())
+    own = SimpleNamespace(
+        plant=plant, _context=plant.CreateDefaultContext(), _tree=None
+    )
     dynamics = SimpleNamespace(body_motion=partial(SceneDynamics.body_motion, own))
     found = felt_motion(dynamics, tip, q, v, acceleration)
     np.testing.assert_allclose(found, expected, atol=1e-9)

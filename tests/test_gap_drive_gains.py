@@ -197,3 +197,15 @@ def test_a_drive_gives_what_it_asks_for_most_of_the_time(tmp_path):
     least = model.least("actuator_saturation", ["d.j2"])
     assert least == {"limit": pytest.approx(np.median(asked))}
     assert "limit" not in model.least("joint_coulomb_friction", ["d.j2"])
+
+
+def test_friction_that_a_scene_has_may_hold_a_joint_at_rest(tmp_path):
+    friction = Effect("joint_coulomb_friction", [JOINTS[0]], {"coulomb": 30.0})
+    scene, recordings = scene_and_log(tmp_path, hidden=[friction])
+    known = InverseModel(replace(scene, effects=[friction]), recordings)
+    (track,) = known.tracks
+    rest = known.at_rest(track, known._rest)[:, 0]
+    assert rest.max() > 0.5  # It sticks where it turns round.
+    assert (known._noises[0]["held"][:, 0] >= 30.0 * rest).all()
+    unknown = InverseModel(scene, recordings)
+    assert unknown._noises[0]["held"][:, 0].max() < 15.0

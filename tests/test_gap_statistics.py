@@ -1272,6 +1272,29 @@ def test_where_simulation_shows_no_gap_any_more_equations_find_none():
     assert decide(none)[0] == "gap_unnamed"
 
 
+@pytest.mark.parametrize(
+    "steady, windows, verdict",
+    [(1.1, 0.9, "no_gap"), (2.5, 0.9, "gap_unnamed"), (1.1, 1.4, "gap_unnamed")],
+)
+def test_no_single_stretch_of_equations_makes_a_gap(steady, windows, verdict):
+    shown = windows_leave(windows, windows)
+    facts = Facts((), 2.4, 2.4, chosen_on=shown, steady=steady)
+    assert decide(facts)[0] == verdict
+
+
+def test_the_steady_error_is_without_the_loudest_block():
+    block = np.repeat(np.arange(6), 10)
+    left = np.where(block == 3, 9.0, 0.5)
+    problem = SimpleNamespace(
+        train=lambda: block == 0, in_noise=lambda x: x, blocks=lambda: block,
+        error=lambda fitted: 4.0,
+    )  # fmt: skip
+    fitted = SimpleNamespace(left=left)
+    assert GapProblem.steady_error(problem, fitted) == pytest.approx(0.5)
+    problem.train = lambda: block < 3
+    assert GapProblem.steady_error(problem, fitted) == 4.0  # Of three blocks.
+
+
 class TwoJoints(MechanismProblem):
     """What is left of two joints' equations and of a velocity, in units of noise."""
 

@@ -8,11 +8,8 @@ back-EMF, gain, bias, limit and lag after it, a gear that loses a share of the l
 Dry friction is steep where a joint stands still; steps are implicit in what a joint's
 force owes to its own position and velocity, so that they need not be as short as that.
 
-Dynamics: Featherstone, "Rigid Body Dynamics Algorithms", 2008: recursive Newton-Euler
-(table 5.1) and composite rigid bodies (table 6.2), here in world axes about the world's
-origin, so that nothing is shifted between links. Steps: Shampine, Reichelt, SIAM J.
-Sci. Comput. 18(1), 1997, section 3.1 (ode23s), a W-method: of second order with any
-Jacobian.
+Steps: Shampine, Reichelt, SIAM J. Sci. Comput. 18(1), 1997, section 3.1 (ode23s), a
+W-method: of second order with any Jacobian.
 """
 
 import math
@@ -22,7 +19,8 @@ import numba
 import numpy as np
 
 from makebreak.systems.arm.numerics.cholesky import cholesky, cholesky_solve
-from makebreak.systems.numerics.joint_laws import law_number
+from makebreak.systems.numerics.joint_laws import JointLaws, law_number
+from makebreak.systems.numerics.joint_tree import JointTree, mass_and_bias
 
 MOST_STEPS = 40_000  # Of one run: beyond it the parameters are given up.
 NO_COMMAND, EFFORT, LOOP = 0, 1, 2  # What drives a joint.
@@ -32,27 +30,15 @@ _LEAST_STEP = 1e-9  # [s]
 
 
 class DrivenArm(NamedTuple):
-    """Constants, SI. Link i moves by joint i; its frame is the joint's, on its side."""
+    """Constants, SI."""
 
-    parent: np.ndarray  # (n,) int, less than i; -1 is the world.
-    slides: np.ndarray  # (n,) bool
-    R_PJ: np.ndarray  # (n, 3, 3) joint i in its parent's frame,
-    p_PJ: np.ndarray  # (n, 3) at zero.
-    axis: np.ndarray  # (n, 3) unit, in the joint's frame.
-    mass: np.ndarray  # (n,) of the link and what is welded to it.
-    p_com: np.ndarray  # (n, 3) in the link's frame.
-    I_com: np.ndarray  # (n, 3, 3) about the centre of mass, in the link's axes.
-    rotor: np.ndarray  # (n,) reflected at the joint.
-    damping: np.ndarray  # (n,)
-    gravity: np.ndarray  # (3,)
+    tree: JointTree
     driven: np.ndarray  # (n,) NO_COMMAND, EFFORT or LOOP.
     law: np.ndarray  # (n, 6) kp, kd, limit, emf, dead band, offset of the encoder.
     path: np.ndarray  # (n, 5) gain, bias, limit, time constant, share lost to friction.
     slow: np.ndarray  # (n,) speed below which a gear's friction fades.
     most: np.ndarray  # (n,) what the joint takes at most.
-    law_joint: np.ndarray  # (m,) int: the joint of each further force,
-    law_kind: np.ndarray  # (m,) int: its number in joint_laws.LAWS,
-    law_p: np.ndarray  # (m, 5) and its numbers.
+    laws: JointLaws  # Further forces.
 
 
 def rollout(arm: DrivenArm, q, v, times, commands, tol: float = 1e-3) -> np.ndarray:
@@ -69,162 +55,6 @@ def rollout(arm: DrivenArm, q, v, times, commands, tol: float = 1e-3) -> np.ndar
         np.ascontiguousarray(commands, float), float(tol), out,
     )  # fmt: skip
     return out
-
-
-@numba.njit(cache=True)
-def mass_and_bias(arm, q, v, M, bias):
-    """Fills the mass matrix M (n, n) with rotors, and the forces bias (n,) that hold
-    the velocities v as they are, gravity with them."""
-    n = q.shape[0]
-    R, p = np.empty((n, 3, 3)), np.empty((n, 3))
-    S, V, A, F = np.empty((n, 6)), np.empty((n, 6)), np.empty((n, 6)), np.empty((n, 6))
-    m, h, I_o = np.empty(n), np.empty((n, 3)), np.empty((n, 3, 3))
-    turn, fixed, half = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    z, c, force = np.empty(3), np.empty(3), np.empty(6)
-    momentum = np.empty(6)
-    for i in range(n):
-        k = arm.parent[i]
-        a0, a1, a2 = arm.axis[i, 0], arm.axis[i, 1], arm.axis[i, 2]
-        if k < 0:
-            for r in range(3):
-                p[i, r] = arm.p_PJ[i, r]
-                for s in range(3):
-                    fixed[r, s] = arm.R_PJ[i, r, s]
-        else:
-            for r in range(3):
-                p[i, r] = p[k, r]
-                for s in range(3):
-                    p[i, r] += R[k, r, s] * arm.p_PJ[i, s]
-                    fixed[r, s] = (
-                        R[k, r, 0] * arm.R_PJ[i, 0, s]
-                        + R[k, r, 1] * arm.R_PJ[i, 1, s]
-                        + R[k, r, 2] * arm.R_PJ[i, 2, s]
-                    )
-        for r in range(3):
-            z[r] = fixed[r, 0] * a0 + fixed[r, 1] * a1 + fixed[r, 2] * a2
-        if arm.slides[i]:
-            for r in range(3):
-                p[i, r] += z[r] * q[i]
-                S[i, r], S[i, 3 + r] = 0.0, z[r]
-                for s in range(3):
-                    R[i, r, s] = fixed[r, s]
-        else:
-            si, co = math.sin(q[i]), math.cos(q[i])
-            t = 1.0 - co
-            turn[0, 0], turn[0, 1] = t * a0 * a0 + co, t * a0 * a1 - si * a2
-            turn[0, 2], turn[1, 0] = t * a0 * a2 + si * a1, t * a0 * a1 + si * a2
-            turn[1, 1], turn[1, 2] = t * a1 * a1 + co, t * a1 * a2 - si * a0
-            turn[2, 0], turn[2, 1] = t * a0 * a2 - si * a1, t * a1 * a2 + si * a0
-            turn[2, 2] = t * a2 * a2 + co
-            for r in range(3):
-                for s in range(3):
-                    R[i, r, s] = (
-                        fixed[r, 0] * turn[0, s]
-                        + fixed[r, 1] * turn[1, s]
-                        + fixed[r, 2] * turn[2, s]
-                    )
-            S[i, 0], S[i, 1], S[i, 2] = z[0], z[1], z[2]
-            S[i, 3] = p[i, 1] * z[2] - p[i, 2] * z[1]
-            S[i, 4] = p[i, 2] * z[0] - p[i, 0] * z[2]
-            S[i, 5] = p[i, 0] * z[1] - p[i, 1] * z[0]
-        # The link's inertia about the world's origin: mass, first moment, matrix.
-        for r in range(3):
-            c[r] = p[i, r]
-            for s in range(3):
-                c[r] += R[i, r, s] * arm.p_com[i, s]
-                half[r, s] = (
-                    R[i, r, 0] * arm.I_com[i, 0, s]
-                    + R[i, r, 1] * arm.I_com[i, 1, s]
-                    + R[i, r, 2] * arm.I_com[i, 2, s]
-                )
-        m[i] = arm.mass[i]
-        square = c[0] * c[0] + c[1] * c[1] + c[2] * c[2]
-        for r in range(3):
-            h[i, r] = m[i] * c[r]
-            for s in range(3):
-                I_o[i, r, s] = (
-                    half[r, 0] * R[i, s, 0]
-                    + half[r, 1] * R[i, s, 1]
-                    + half[r, 2] * R[i, s, 2]
-                    - m[i] * c[r] * c[s]
-                )
-            I_o[i, r, r] += m[i] * square
-        # Twist, and acceleration at constant velocities, gravity as one of the base.
-        for r in range(6):
-            V[i, r] = 0.0
-            A[i, r] = 0.0
-        if k < 0:
-            for r in range(3):
-                A[i, 3 + r] = -arm.gravity[r]
-        else:
-            for r in range(6):
-                V[i, r], A[i, r] = V[k, r], A[k, r]
-            w0, w1, w2 = V[k, 0], V[k, 1], V[k, 2]
-            u0, u1, u2 = V[k, 3], V[k, 4], V[k, 5]
-            s0, s1, s2 = S[i, 0] * v[i], S[i, 1] * v[i], S[i, 2] * v[i]
-            s3, s4, s5 = S[i, 3] * v[i], S[i, 4] * v[i], S[i, 5] * v[i]
-            A[i, 0] += w1 * s2 - w2 * s1
-            A[i, 1] += w2 * s0 - w0 * s2
-            A[i, 2] += w0 * s1 - w1 * s0
-            A[i, 3] += w1 * s5 - w2 * s4 + u1 * s2 - u2 * s1
-            A[i, 4] += w2 * s3 - w0 * s5 + u2 * s0 - u0 * s2
-            A[i, 5] += w0 * s4 - w1 * s3 + u0 * s1 - u1 * s0
-        for r in range(6):
-            V[i, r] += S[i, r] * v[i]
-        _times(force, m[i], h[i], I_o[i], A[i])
-        _times(momentum, m[i], h[i], I_o[i], V[i])
-        w0, w1, w2 = V[i, 0], V[i, 1], V[i, 2]
-        u0, u1, u2 = V[i, 3], V[i, 4], V[i, 5]
-        k0, k1, k2, l0, l1, l2 = (
-            momentum[0], momentum[1], momentum[2], momentum[3], momentum[4],
-            momentum[5],
-        )  # fmt: skip
-        F[i, 0] = force[0] + w1 * k2 - w2 * k1 + u1 * l2 - u2 * l1
-        F[i, 1] = force[1] + w2 * k0 - w0 * k2 + u2 * l0 - u0 * l2
-        F[i, 2] = force[2] + w0 * k1 - w1 * k0 + u0 * l1 - u1 * l0
-        F[i, 3] = force[3] + w1 * l2 - w2 * l1
-        F[i, 4] = force[4] + w2 * l0 - w0 * l2
-        F[i, 5] = force[5] + w0 * l1 - w1 * l0
-    for i in range(n - 1, -1, -1):
-        total = 0.0
-        for r in range(6):
-            total += S[i, r] * F[i, r]
-        bias[i] = total
-        _times(momentum, m[i], h[i], I_o[i], S[i])
-        for j in range(i):
-            M[i, j] = 0.0
-            M[j, i] = 0.0
-        j = i
-        while j >= 0:
-            total = 0.0
-            for r in range(6):
-                total += S[j, r] * momentum[r]
-            M[i, j] = total
-            M[j, i] = total
-            j = arm.parent[j]
-        M[i, i] += arm.rotor[i]
-        k = arm.parent[i]
-        if k >= 0:
-            m[k] += m[i]
-            for r in range(3):
-                h[k, r] += h[i, r]
-                for s in range(3):
-                    I_o[k, r, s] += I_o[i, r, s]
-            for r in range(6):
-                F[k, r] += F[i, r]
-
-
-@numba.njit(cache=True, inline="always")
-def _times(out, m, h, I_o, twist):
-    """Spatial momentum [about the origin, linear] of an inertia moving by a twist."""
-    w0, w1, w2 = twist[0], twist[1], twist[2]
-    u0, u1, u2 = twist[3], twist[4], twist[5]
-    out[0] = I_o[0, 0] * w0 + I_o[0, 1] * w1 + I_o[0, 2] * w2 + h[1] * u2 - h[2] * u1
-    out[1] = I_o[1, 0] * w0 + I_o[1, 1] * w1 + I_o[1, 2] * w2 + h[2] * u0 - h[0] * u2
-    out[2] = I_o[2, 0] * w0 + I_o[2, 1] * w1 + I_o[2, 2] * w2 + h[0] * u1 - h[1] * u0
-    out[3] = m * u0 + w1 * h[2] - w2 * h[1]
-    out[4] = m * u1 + w2 * h[0] - w0 * h[2]
-    out[5] = m * u2 + w0 * h[1] - w1 * h[0]
 
 
 @numba.njit(cache=True)
@@ -254,7 +84,7 @@ def _on_joint(arm, i, q, v, y, told, told_rate):
     if share > 0.0 and u != 0.0:
         lost = share * math.tanh(v / arm.slow[i])
         u = u / (1.0 + lost) if u > 0.0 else u / (1.0 - lost)
-    return min(max(u, -arm.most[i]), arm.most[i]) - arm.damping[i] * v
+    return min(max(u, -arm.most[i]), arm.most[i]) - arm.tree.damping[i] * v
 
 
 @numba.njit(cache=True)
@@ -262,9 +92,9 @@ def _forces(arm, t, q, v, y, told, out):
     """Fills the forces on the joints (n,), but what mass_and_bias gives."""
     for i in range(q.shape[0]):
         out[i] = _on_joint(arm, i, q[i], v[i], y[i], told[0, i], told[1, i])
-    for j in range(arm.law_joint.shape[0]):
-        i = arm.law_joint[j]
-        out[i] += law_number(arm.law_kind[j], q[i], v[i], t, arm.law_p[j])
+    for j in range(arm.laws.joint.shape[0]):
+        i = arm.laws.joint[j]
+        out[i] += law_number(arm.laws.kind[j], q[i], v[i], t, arm.laws.p[j])
 
 
 @numba.njit(cache=True)
@@ -276,9 +106,9 @@ def _slopes(arm, t, q, v, y, told, K, D):
         now = _on_joint(arm, i, q[i], v[i], y[i], told[0, i], told[1, i])
         K[i] = now - _on_joint(arm, i, q[i] + dq, v[i], y[i], told[0, i], told[1, i])
         D[i] = now - _on_joint(arm, i, q[i], v[i] + dv, y[i], told[0, i], told[1, i])
-    for j in range(arm.law_joint.shape[0]):
-        i = arm.law_joint[j]
-        p, kind = arm.law_p[j], arm.law_kind[j]
+    for j in range(arm.laws.joint.shape[0]):
+        i = arm.laws.joint[j]
+        p, kind = arm.laws.p[j], arm.laws.kind[j]
         now = law_number(kind, q[i], v[i], t, p)
         K[i] += now - law_number(kind, q[i] + dq, v[i], t, p)
         D[i] += now - law_number(kind, q[i], v[i] + dv, t, p)
@@ -293,7 +123,7 @@ def _rate(arm, t, x, told, M, L, bias, tau, out):
     y: what the motors that lag give."""
     n = bias.shape[0]
     q, v, y = x[:n], x[n : 2 * n], x[2 * n :]
-    mass_and_bias(arm, q, v, M, bias)
+    mass_and_bias(arm.tree, q, v, M, bias)
     _forces(arm, t, q, v, y, told, tau)
     for i in range(n):
         out[i] = v[i]

@@ -14,7 +14,8 @@ from makebreak.gap.numerics.signal_noise import jump_variance
 from makebreak.gap.residuals.mechanism_motion import MechanismMotion
 from makebreak.gap.residuals.track import Track
 from makebreak.models.dynamics import SceneDynamics
-from makebreak.models.scene import Scene
+from makebreak.models.scene import Scene, joint_laws
+from makebreak.systems.numerics.joint_laws import most_friction
 
 OTHERS = ("velocity", "effort_measured")  # Channels that are compared beside.
 # A joint that stands still, slower than this [rad/s], or [m/s], may be held by any
@@ -46,6 +47,11 @@ class WhitenedRows(MechanismMotion):
         # much [N m]; NaN: by REST_EFFORT of their rms effort.
         self._rest = np.full(len(self.joints), REST_SPEED)
         self._hold = np.full(len(self.joints), np.nan)
+        # (n_joints,) What the scene's own dry friction holds.
+        self._dry = most_friction(
+            joint_laws(self.dynamics.loaded.effects, self.dynamics.plant),
+            len(self.joints),
+        )
         self._noises = self._noise_of_rows()
         # What models are off by, beside noise [N m, rad/s].
         self.model_error = {
@@ -85,6 +91,7 @@ class WhitenedRows(MechanismMotion):
         rest = self.at_rest(track, self._rest)
         untold = np.where(rest > REST_SHARE, rest, 0.0) * REST_EFFORT * rms
         held = np.where(np.isnan(self._hold), untold, rest * self._hold)
+        held = np.maximum(held, rest * self._dry)
         centre = np.clip(
             np.searchsorted(track.middle, track.bumps.centre), 0, len(q) - 1
         )

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import BodyIndex, PrismaticJoint, RevoluteJoint
 from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.gap.does_not_fit import DoesNotFit
@@ -14,7 +13,6 @@ from makebreak.gap.numerics.driven_arm import (
     LOOP,
     NO_COMMAND,
     DrivenArm,
-    mass_and_bias,
     rollout,
 )
 from makebreak.gap.simulation.scene_simulation import SceneSimulation
@@ -46,9 +44,11 @@ from makebreak.models.effects.kind import (
     velocity_unit,
 )
 from makebreak.models.effects.measured_channels import ChannelMap, channel_maps
+from makebreak.models.joint_tree import NoJointTree, joint_tree, rotors_and_damping
 from makebreak.models.scene import Scene, joint_laws, load_scene
 from makebreak.models.scene_schema import COMMANDS_OF, as_kind
-from makebreak.systems.numerics.joint_laws import FADES_AT
+from makebreak.systems.numerics.joint_laws import FADES_AT, JointLaws
+from makebreak.systems.numerics.joint_tree import JointTree, mass_and_bias
 
 # Of the speed below which Drake's friction fades, which its steps need; these are
 # implicit in what a joint's force owes to its speed. At more, a joint that should stay
@@ -71,7 +71,7 @@ class DrivenArmScene:
 
     def __init__(self, scene: Scene):
         self.scene = scene = replace(scene, plant=replace(scene.plant, time_step=0.0))
-        self._plants: dict[tuple, tuple[MultibodyPlant, dict]] = {}
+        self._plants: dict[tuple, tuple[MultibodyPlant, JointTree]] = {}
         self._plant(scene.effects)
         self.arm(())
 
@@ -85,29 +85,30 @@ class DrivenArmScene:
         for effect in every:
             if not can_have(effect.kind):
                 raise DoesNotFit(f"effect {effect.kind} takes Drake's own steps")
-        plant, body_numbers = self._plant([e for e in every if _in_plant(e.kind)])
+        plant, tree = self._plant([e for e in every if _in_plant(e.kind)])
         links = [e for e in every if _of_link(e.kind)]
         joints = [e for e in every if _of_joint(e.kind)]
         if links or joints:
             context = _changed(plant, [*links, *joints])
             if links:
-                body_numbers = _tree(plant, context)
+                tree = joint_tree(plant, context)
             else:
-                body_numbers = {**body_numbers, **_joint_numbers(plant, context)}
+                tree = tree._replace(**rotors_and_damping(plant, context))
         for effect in every:
             possible = KINDS[effect.kind].possible
             if possible is not None:
                 possible(effect, plant, every)
-        arm = DrivenArm(**body_numbers, **self._drives(plant, every))
-        n = len(arm.parent)
+        arm = DrivenArm(tree, **self._drives(plant, every))
+        n = len(tree.parent)
         names = {j.velocity_start(): full_name(plant, j) for j in one_dof_joints(plant)}
         q = plant.GetPositions(plant.CreateDefaultContext())
-        mass_and_bias(arm, q, np.zeros(n), M := np.empty((n, n)), np.empty(n))
+        M = np.empty((n, n))
+        mass_and_bias(tree, q, np.zeros(n), M, np.empty(n))
         mobility = np.diag(np.linalg.inv(M))
         if self.scene.actuation.type in STIFF_TYPES:
             for i in np.flatnonzero(arm.driven == LOOP):
                 check_stiffness(mobility[i], arm.law[i, 1] + arm.law[i, 3], names[i])
-        return arm._replace(law_p=self._law_p(arm, mobility))
+        return arm._replace(laws=self._held(arm.laws, mobility))
 
     @property
     def has_shapes(self) -> bool:
@@ -123,19 +124,19 @@ class DrivenArmScene:
             told,
         )
 
-    def _law_p(self, arm: DrivenArm, mobility: np.ndarray) -> np.ndarray:
-        """(m, 4) with dry friction that holds: below a speed that is no more than these
+    def _held(self, laws: JointLaws, mobility: np.ndarray) -> JointLaws:
+        """With dry friction that holds: below a speed that is no more than these
         steps need, or with which a joint creeps in so far as the scene's does."""
-        p = arm.law_p.copy()
-        for j, kind in enumerate(arm.law_kind):
+        p = laws.p.copy()
+        for j, kind in enumerate(laws.kind):
             if int(kind) in FADES_AT:
-                at, i = FADES_AT[int(kind)], int(arm.law_joint[j])
+                at, i = FADES_AT[int(kind)], int(laws.joint[j])
                 most = np.abs(p[j, : min(at, 2)]).max()
                 creeps = self.creep_sec * most * mobility[i]
                 p[j, at] = max(HOLDS * p[j, at], creeps)
-        return p
+        return laws._replace(p=p)
 
-    def _plant(self, effects) -> tuple[MultibodyPlant, dict]:
+    def _plant(self, effects) -> tuple[MultibodyPlant, JointTree]:
         """A plant with these effects, and what of a DrivenArm it decides."""
         key = tuple(e.key for e in effects)
         if key not in self._plants:
@@ -145,7 +146,10 @@ class DrivenArmScene:
             undriven = replace(self.scene.actuation, type="effort")
             scene = replace(self.scene, actuation=undriven, effects=list(effects))
             loaded = load_scene(scene, DiagramBuilder())
-            self._plants[key] = loaded.plant, _tree(loaded.plant)
+            try:
+                self._plants[key] = loaded.plant, joint_tree(loaded.plant)
+            except NoJointTree as error:
+                raise DoesNotFit(str(error)) from None
         return self._plants[key]
 
     def _drives(self, plant: MultibodyPlant, effects: Sequence[Effect]) -> dict:
@@ -185,10 +189,9 @@ class DrivenArmScene:
                         law[i, 0] = 0.0
                     else:
                         self._step[i] = own.resolution
-        forces = joint_laws(effects, plant)
         return dict(
             driven=driven, law=law, path=path, slow=slow, most=most,
-            law_joint=forces.joint, law_kind=forces.kind, law_p=forces.p,
+            laws=joint_laws(effects, plant),
         )  # fmt: skip
 
 
@@ -283,86 +286,3 @@ def _changed(plant: MultibodyPlant, effects: Sequence[Effect]):
         none = dict.fromkeys(effect.parameters, 0.0)
         change(Effect(effect.kind, effect.at, none), effect, plant, context)
     return context
-
-
-def _joint_numbers(plant: MultibodyPlant, context) -> dict:
-    rotor, damping = np.zeros((2, plant.num_velocities()))
-    for joint in one_dof_joints(plant):
-        if joint.num_velocities():
-            damping[joint.velocity_start()] = joint.GetDampingVector(context)[0]
-    for index in plant.GetJointActuatorIndices():
-        actuator = plant.get_joint_actuator(index)
-        at = actuator.joint().velocity_start()
-        rotor[at] += actuator.calc_reflected_inertia(context)
-    return dict(rotor=rotor, damping=damping)
-
-
-def _tree(plant: MultibodyPlant, context=None) -> dict:
-    """The joints and links of a plant, as of a DrivenArm.
-
-    context: with its inertias; None: the plant's own.
-
-    Raises: DoesNotFit for anything else that moves, or pulls.
-    """
-    joints = sorted(
-        (j for j in one_dof_joints(plant) if j.num_velocities()),
-        key=lambda j: j.velocity_start(),
-    )
-    n = plant.num_velocities()
-    if len(joints) != n or plant.num_positions() != n:
-        raise DoesNotFit(
-            "expected joints that turn or slide and nothing else that moves"
-        )
-    if not all(isinstance(j, RevoluteJoint | PrismaticJoint) for j in joints):
-        raise DoesNotFit("expected joints that turn or slide")
-    if plant.num_force_elements() > 1:
-        raise DoesNotFit("expected no force elements but gravity")
-    context = context or plant.CreateDefaultContext()
-    plant.SetPositions(context, np.zeros(n))
-    carried = {j.child_body().index(): i for i, j in enumerate(joints)}
-    inner = {
-        j.child_body().index(): j.parent_body().index()
-        for j in (plant.get_joint(i) for i in plant.GetJointIndices())
-    }
-
-    def link_of(body) -> int:
-        """The joint that a body moves with; -1 for the world."""
-        while body not in carried:
-            if body not in inner:
-                return -1
-            body = inner[body]
-        return carried[body]
-
-    X_WM = [j.frame_on_child().CalcPoseInWorld(context) for j in joints]
-    parent = np.array([link_of(j.parent_body().index()) for j in joints])
-    if (parent >= np.arange(n)).any():
-        raise DoesNotFit("expected joints in order, from the base outwards")
-    R_PJ, p_PJ, axis = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3))
-    mass, moment, about = np.zeros(n), np.zeros((n, 3)), np.zeros((n, 3, 3))
-    for i, joint in enumerate(joints):
-        X = X_WM[i] if parent[i] < 0 else X_WM[parent[i]].inverse() @ X_WM[i]
-        R_PJ[i], p_PJ[i] = X.rotation().matrix(), X.translation()
-        turns = isinstance(joint, RevoluteJoint)
-        a = joint.revolute_axis() if turns else joint.translation_axis()
-        axis[i] = a / np.linalg.norm(a)
-    for k in range(1, plant.num_bodies()):
-        body = plant.get_body(BodyIndex(k))
-        i = link_of(body.index())
-        if i < 0:
-            continue
-        X = X_WM[i].inverse() @ plant.EvalBodyPoseInWorld(context, body)
-        M = body.CalcSpatialInertiaInBodyFrame(context)
-        M = M.ReExpress(X.rotation()).Shift(-X.translation())
-        mass[i] += M.get_mass()
-        moment[i] += M.CalcComMoment()
-        about[i] += M.CalcRotationalInertia().CopyToFullMatrix3()
-    p_com = moment / np.where(mass == 0.0, 1.0, mass)[:, None]
-    for i, c in enumerate(p_com):
-        about[i] -= mass[i] * (c @ c * np.eye(3) - np.outer(c, c))
-    return dict(
-        parent=parent.astype(np.int64),
-        slides=np.array([isinstance(j, PrismaticJoint) for j in joints]),
-        R_PJ=R_PJ, p_PJ=p_PJ, axis=axis, mass=mass, p_com=p_com, I_com=about,
-        **_joint_numbers(plant, context),
-        gravity=np.array(plant.gravity_field().gravity_vector()),
-    )  # fmt: skip

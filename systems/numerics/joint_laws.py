@@ -91,3 +91,12 @@ class JointLaws(NamedTuple):
     joint: np.ndarray  # (m,) int: index of the joint's position and velocity.
     kind: np.ndarray  # (m,) int: number in LAWS.
     p: np.ndarray  # (m, N_NUMBERS)
+
+
+def most_friction(laws: JointLaws, n: int) -> np.ndarray:
+    """(n,) the most that laws of dry friction hold n joints with [N m] or [N]."""
+    out = np.zeros(n)
+    for i, kind, p in zip(*laws, strict=True):
+        if int(kind) in FADES_AT:
+            out[i] += np.abs(p[: min(FADES_AT[int(kind)], 2)]).max()
+    return out
