@@ -290,15 +290,17 @@ def _compared(
         gap has a name for is not asked again: that takes as long as the first.)"""
         first = problem, selection, result
         say("preparing another comparison")
-        try:
-            other, found = other_problem(problem, scene, decided, dynamics, jobs)
-        except DoesNotFit:
-            return first
-        say("searching the catalogue in another way")
         with budget.share(1).running() as own:
+            try:
+                other, found = other_problem(problem, scene, decided, dynamics, jobs)
+            except DoesNotFit:
+                return first
+            say("searching the catalogue in another way")
             then = select(other, say)
-        named = conclude(other, then, reported, [*checks, *found], jobs)
-        if named.verdict in ("gap_unnamed", "not_judged"):
+        with budget.part(CONCLUDE):
+            named = conclude(other, then, reported, [*checks, *found], jobs)
+        unnamed = named.verdict in ("gap_unnamed", "not_judged")
+        if unnamed and not named.gap.reduction > result.gap.reduction:
             return first
         searched.undone[:] = own.undone
         return other, then, named
