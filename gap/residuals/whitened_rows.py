@@ -204,18 +204,16 @@ class WhitenedRows(MechanismMotion):
         old = self._whiteners
         self._plain = self._whitened_by({w: 0.0 * x for w, x in error.items()})
         self.model_error, self._whiteners = error, self._whitened_by(error)
-        new = self._whiteners
-        return lambda rows: self._rewhitened(rows, old, new)
+        return self._between(old, self._whiteners)
 
     def in_noise(self, left: np.ndarray) -> np.ndarray:
         """Rows (m,) over the sensors' noise alone."""
-        return self._rewhitened(left, self._whiteners, self._plain)
+        return self._between(self._whiteners, self._plain)(left)
 
     def in_units(self, left: np.ndarray) -> np.ndarray:
         """(n_bumps, n_names) of rows (m,): [N m] or [N], and units of channels."""
-        return self._rewhitened(left, self._whiteners, None).reshape(
-            -1, len(self.names())
-        )
+        in_units = self._between(self._whiteners, None)(left)
+        return in_units.reshape(-1, len(self.names()))
 
     def noise_in_units(self, held: bool = True) -> np.ndarray:
         """(n_bumps, n_names) standard deviations that the sensors' noise gives, and,
@@ -231,26 +229,31 @@ class WhitenedRows(MechanismMotion):
             found.append(np.hstack([std, np.tile(row, (len(C), 1))]))
         return np.concatenate(found)
 
-    def _rewhitened(self, rows: np.ndarray, old, new) -> np.ndarray:
-        """Rows (m, ...) in the units of other whiteners; None: in the channels' own."""
-        k, n = len(self.names()), len(self.joints)
-        others = self._other_names()
-        parts, first = [], 0
-        for i, track in enumerate(self.tracks):
-            size = len(track.bumps.centre)
-            mine = np.array(rows[first : first + size * k])
-            first += size * k
-            mine = mine.reshape(size, k, *rows.shape[1:])
-            T = np.linalg.inv(old[i]["effort"])
-            if new is not None:
-                T = new[i]["effort"] @ T
-            mine[:, :n] = np.einsum("bij,bj...->bi...", T, mine[:, :n])
-            for c, (what, joint) in enumerate(others):
-                j = self.joints.index(joint)
-                by = 1.0 if new is None else new[i][what][j]
-                mine[:, n + c] *= old[i][what][j] / by
-            parts.append(mine.reshape(size * k, *rows.shape[1:]))
-        return np.concatenate(parts)
+    def _between(self, old, new) -> Callable[[np.ndarray], np.ndarray]:
+        """Gives rows (m, ...) in the units of other whiteners; None: in the channels'
+        own."""
+        others = [(w, self.joints.index(joint)) for w, joint in self._other_names()]
+        n = len(self.joints)
+        turns = [np.linalg.inv(white["effort"]) for white in old]
+        if new is not None:
+            turns = [to["effort"] @ T for to, T in zip(new, turns, strict=True)]
+        sizes = [
+            [old[i][w][j] / (1.0 if new is None else new[i][w][j]) for w, j in others]
+            for i in range(len(old))
+        ]
+
+        def moved(rows: np.ndarray) -> np.ndarray:
+            out, first = np.array(rows, order="C"), 0
+            for T, size in zip(turns, sizes, strict=True):
+                m = len(T) * (n + len(size))
+                mine = out[first : first + m].reshape(len(T), -1, *rows.shape[1:])
+                first += m
+                mine[:, :n] = np.einsum("bij,bj...->bi...", T, mine[:, :n])
+                for c, by in enumerate(size):
+                    mine[:, n + c] *= by
+            return out
+
+        return moved
 
     def _mass_matrix(self, q) -> np.ndarray:
         plant, context = self._weighed_by.plant, self._weighed_by._context
