@@ -196,6 +196,22 @@ def test_limits_are_those_of_the_urdf_with_and_without_a_transmission(
         LogDesign(scene, ["joint_viscous_damping"], plan)
 
 
+def test_a_robot_whose_meshes_are_not_there_has_a_motion_too(tmp_path):
+    """As `gap` takes it: without what it would touch."""
+    pendulum(tmp_path)
+    file = next(tmp_path.glob("*.urdf"))
+    mesh = '<geometry><mesh filename="package://far_away/rod.stl"/></geometry>'
+    text = file.read_text()
+    file.write_text(text.replace("</link>", f"<collision>{mesh}</collision></link>"))
+    words = ["design-log", str(file), "--seconds", "6", "--period", "3"]
+    words += ["--harmonics", "2", "--for", "joint_viscous_damping", "--velocity", "4"]
+    out = tmp_path / "out"
+    assert main([*words, "--effort", "15", "--out", str(out)]) == 0
+    (model,) = read_yaml(out / "scene.yaml")["directives"][:1]
+    copy = out / model["add_model"]["file"]
+    assert copy.is_file() and "far_away" not in copy.read_text()
+
+
 def test_what_cannot_be_designed_is_one_line(tmp_path):
     scene = driven(double(tmp_path), ["d.j1", "d.j2"])
     for words, says in (

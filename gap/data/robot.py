@@ -517,25 +517,10 @@ def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
             at, _, what = channel.rpartition(".")
             if at and at not in kinds.setdefault(what, []):
                 kinds[what].append(at)
-    notes: list[str] = []
-    copies: dict[str, str] = {}
-    lines = [
-        "# A proposal, to be corrected. docs/station.md, docs/recordings.md",
-        "directives:",
-        f"- add_model: {{name: {robot.model}, file: {json.dumps(_file(robot))}}}",
-    ]
-    if left_out := robot.file.left_out:
-        name = f"{robot.path.stem}_without_meshes{robot.file.suffix}"
-        lines[-1] = f"- add_model: {{name: {robot.model}, file: {name}}}"
-        lines[-1] += "  # A copy: collision meshes are not there."
-        copies = {name: robot.file.text}
-        notes.append(
-            f"{left_out} collision meshes of {robot.path.name} are not there and left "
-            "out, so it touches nothing (--package NAME=PATH says where they are)"
-        )
-    more, said_of_base = _welds(robot)
-    lines += more
-    notes += said_of_base
+    lines, copies, notes = directives_of(robot)
+    lines.insert(
+        0, "# A proposal, to be corrected. docs/station.md, docs/recordings.md"
+    )
     if fixed:
         where = ", ".join(f"{name}: {q:g}" for name, q in fixed.items())
         lines.append(
@@ -595,6 +580,27 @@ def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
         robot.file.notes,
         said,
     )
+
+
+def directives_of(robot: Robot) -> tuple[list[str], dict[str, str], list[str]]:
+    """Lines of a scene with the robot on the world; {name: text} of files beside it,
+    where the robot's own cannot be used as it is; notes for the user."""
+    lines = [
+        "directives:",
+        f"- add_model: {{name: {robot.model}, file: {json.dumps(_file(robot))}}}",
+    ]
+    copies, notes = {}, []
+    if left_out := robot.file.left_out:
+        name = f"{robot.path.stem}_without_meshes{robot.file.suffix}"
+        lines[-1] = f"- add_model: {{name: {robot.model}, file: {name}}}"
+        lines[-1] += "  # A copy: collision meshes are not there."
+        copies = {name: robot.file.text}
+        notes.append(
+            f"{left_out} collision meshes of {robot.path.name} are not there and left "
+            "out, so it touches nothing (--package NAME=PATH says where they are)"
+        )
+    more, said_of_base = _welds(robot)
+    return [*lines, *more], copies, [*notes, *said_of_base]
 
 
 def _welds(robot: Robot) -> tuple[list[str], list[str]]:

@@ -11,7 +11,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from makebreak.gap.data.robot import read_robot
+from makebreak.gap.data.robot import directives_of, read_robot
 from makebreak.gap.data.table import write_recording
 from makebreak.gap.design import DesignedLog, LogDesign, LogPlan
 from makebreak.models.scene import Scene, read_scene
@@ -46,9 +46,7 @@ def design_log(
             progress("reading the scene")
             robot = scene_path.suffix.lower() in (".urdf", ".sdf", ".xml", ".xacro")
             scene = (
-                _scene_of_robot(scene_path, out.file("scene.yaml"))
-                if robot
-                else read_scene(scene_path)
+                _scene_of_robot(scene_path, out) if robot else read_scene(scene_path)
             )
             found = LogDesign(scene, named, plan).solve(progress)
         write_recording(out.file("design.csv"), found.columns())
@@ -64,15 +62,14 @@ def design_log(
         return table, out.commit()
 
 
-def _scene_of_robot(path: Path, file: Path) -> Scene:
+def _scene_of_robot(path: Path, out: OutputFolder) -> Scene:
     """The robot upright on the world, its joints driven by efforts."""
-    robot = read_robot(path)
-    uri = json.dumps(f"file://{path.resolve()}")
-    lines = [f"- add_model: {{name: {robot.model}, file: {uri}}}"]
-    for base in robot.bases:
-        lines.append(f"- add_weld: {{parent: world, child: {robot.model}::{base}}}")
+    robot, file = read_robot(path), out.file("scene.yaml")
+    lines, copies, _ = directives_of(robot)
+    for name, text in copies.items():
+        out.file(name).write_text(text)
     joints = ", ".join(joint.name for joint in robot.joints)
-    lines = ["directives:", *lines, f"actuation: {{type: effort, joints: [{joints}]}}"]
+    lines.append(f"actuation: {{type: effort, joints: [{joints}]}}")
     file.write_text("\n".join(lines) + "\n")
     return read_scene(file)
 
