@@ -822,8 +822,7 @@ def _drives_that_drive(contents: Contents, matches, said) -> list[Match]:
 
 
 def _share(contents: Contents, column: str, i: int) -> float:
-    found = contents.of_effort(column, i)
-    return 0.0 if found is None else found.explained
+    return 1.0 - contents.told(column, i).left
 
 
 # ----- Factors and signs
