@@ -233,26 +233,18 @@ class GentleRollingConfig:
     seed: int = 0
 
 
-# What `telemetry_log` holds: name -> (system, port, size).
+# What `telemetry_log` holds: name -> (system, port, size). What is computed when asked
+# for is computed for it anew each millisecond: no more than what is scored.
 SIGNALS = {
-    "task_phase": ("rolling_task", "phase", 1),
     "kind": ("push_motion", "kind", 1),
     "trial": ("push_motion", "trial", 1),
     "active": ("push_motion", "active", 1),
     "ee_pose": ("tip_state", "ee_pose", 7),
-    "in_frame": ("moving_frame", "ee_pose", 7),
-    "wrench": ("wrench_tare", "wrench", 6),
-    "tare_status": ("wrench_tare", "status", 1),
-    "bias": ("wrench_tare", "bias", 6),
     "x_desired": ("reference_blend", "x_desired", 19),
-    "shaped": ("velocity_shaper", "x_desired", 19),
     "phase": ("velocity_shaper", "phase", 6),
     "contact": ("contact_detector", "contact", 14),
     "mode": ("mode_detector", "mode", 1),
-    "confidence": ("mode_detector", "confidence", 2),
-    "wrench_predicted": ("forward_model_bank", "wrench_predicted", 6),
     "prediction_error": ("forward_model_bank", "prediction_error", 1),
-    "approach_speed": ("contact_anticipator", "approach_speed", 1),
     "stiffness": ("variable_impedance", "stiffness", 6),
 }
 
