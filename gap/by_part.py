@@ -6,6 +6,7 @@ its own, in a fraction of the time, and one that is not explained spoils no othe
 verdict.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -99,6 +100,7 @@ def joined(limbs: Sequence[Sequence[str]], results: Sequence[GapResult]) -> GapR
         (v for v in ("gap_unnamed", "ambiguous", "gap_named", "not_judged")
          if v in verdicts), "no_gap",
     )  # fmt: skip
+    results = _said_alike(results)
     effects = _effects(limbs, results)
     agree = [k for k, v in enumerate(verdicts) if v in AGREES]
     words = [
@@ -134,6 +136,41 @@ def joined(limbs: Sequence[Sequence[str]], results: Sequence[GapResult]) -> GapR
                          "channels", "nuisance_scene", "differs", "tried")
         },
     )  # fmt: skip
+
+
+def _said_alike(results: Sequence[GapResult]) -> list[GapResult]:
+    """The results, in which what limbs cannot tell apart is what most of them say."""
+    told = Counter((e.kind, e.at) for r in results for e in r.effects)
+
+    def alike(effect: NamedEffect) -> NamedEffect:
+        ties = {(t.kind, tuple(t.at)): t for t in effect.indistinguishable_from}
+        most = max([(effect.kind, effect.at), *ties], key=lambda name: told[name])
+        if most not in ties:
+            return effect
+        instead = ties.pop(most)
+        others = (*ties.values(), effect.effect())
+        if {len(effect.parameters), len(instead.parameters)} != {1}:
+            return effect  # How sure the other one is was not asked.
+        ((name, value),) = instead.parameters.items()
+        (old,) = effect.parameters.values()
+        unit = KINDS[instead.kind].parameter(name).unit
+        if unit != old.unit:
+            return effect
+        estimate = replace(old, value=value)
+        return _said(replace(
+            effect, kind=instead.kind, at=tuple(instead.at),
+            parameters={name: estimate}, indistinguishable_from=others,
+        ))  # fmt: skip
+
+    found = []
+    for r in results:
+        effects, words = [alike(e) for e in r.effects], r.says
+        for old, new in zip(r.effects, effects, strict=True):
+            words = words.replace(old.says, new.says)
+            words = words.replace(f"distinguish it from {new.kind}",
+                                  f"distinguish it from {old.kind}")  # fmt: skip
+        found.append(replace(r, effects=effects, says=words))
+    return found
 
 
 def _called(limb: Sequence[str]) -> str:

@@ -21,6 +21,7 @@ from makebreak.gap.result import (
 )
 from makebreak.gap.workflow import run_gap
 from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import read_scene
 
 LIMBS = [["r.a0", "r.a1"], ["r.b0", "r.b1"]]
@@ -182,6 +183,31 @@ def test_what_all_limbs_have_alike_is_one_effect_of_the_model():
     assert effect.at == ("r",)
     assert effect.parameters["delay"].value == pytest.approx(0.0105)
     assert effect.parameters["delay"].std == pytest.approx(0.001 / np.sqrt(2.0))
+
+
+def test_what_limbs_cannot_tell_apart_is_what_most_of_them_say():
+    late = Effect("sensor_delay", ["r"], {"delay": 0.011})
+    sure = replace(delay(("r",), 0.010), indistinguishable_from=(late,))
+    other = replace(
+        sure, kind="sensor_delay", parameters={"delay": Estimate(0.013, 0.001, "s")},
+        indistinguishable_from=(Effect("input_delay", ["r"], {"delay": 0.012}),),
+    )  # fmt: skip
+    each = [result_of("ambiguous", [e]) for e in (other, sure, sure)]
+    words = "It is seen late. These data cannot distinguish it from input_delay."
+    other = replace(other, says="It is seen late.")
+    each[0] = replace(each[0], effects=[other], says=words)
+    limbs = [*LIMBS, ["r.c0"]]
+    result = joined(limbs, each)
+    (effect,) = result.effects
+    assert "It is seen late" not in result.says and "Commands reach" in result.says
+    assert "cannot distinguish it from sensor_delay" in result.says
+    assert (effect.kind, effect.at) == ("input_delay", ("r",))
+    assert effect.parameters["delay"].value == pytest.approx(0.032 / 3.0)
+    untied = replace(other, indistinguishable_from=())
+    each = [result_of("ambiguous", [e]) for e in (untied, sure, sure)]
+    assert {e.kind for e in joined(limbs, each).effects} == {
+        "sensor_delay", "input_delay"
+    }  # fmt: skip
 
 
 def test_what_limbs_have_otherwise_stays_at_their_joints():
