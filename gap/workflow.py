@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -92,6 +93,7 @@ from makebreak.gap.search.select import select, without
 from makebreak.gap.search.softer_by_simulation import softer_by_simulation
 from makebreak.gap.search.trust import drift_sentences, scatter, trust_in
 from makebreak.gap.simulation.measure import WINDOW_SEC
+from makebreak.gap.simulation.scene_simulation import SceneSimulation
 from makebreak.gap.simulation.windows import WindowModel, with_step
 from makebreak.gap.thresholds import (
     AGREEMENT_RMS_MAX,
@@ -121,6 +123,9 @@ from makebreak.models.scene import Scene, read_scene
 ProblemOf = Callable[..., tuple[GapProblem, list[Finding]]]
 # Of longer recordings of a mechanism, and of more rows of anything, pieces are used.
 MOST_SEC, MOST_ROWS = 60.0, 120_000
+# Windows that tell how far a step errs: where that decides which one is taken, and
+# where it is only said.
+ASKED, TOLD_BY = 24, 8
 # Of what is only reported on.
 REPORTED_SEC, REPORTED_ROWS = 20.0, 40_000
 
@@ -834,12 +839,15 @@ def _settle_step(
     step = scene.plant.time_step
     if step == 0.0:
         return scene, []
-    fine = with_step(scene, 0.0 if _is_mechanism(dynamics, recordings) else step / 4.0)
+    is_mechanism = _is_mechanism(dynamics, recordings)
+    fine = with_step(scene, 0.0 if is_mechanism else step / 4.0)
+    most = TOLD_BY if is_mechanism else ASKED
     try:
-        coarse_model = WindowModel(scene, recordings, WINDOW_SEC, most=24)
-        fine_model = WindowModel(fine, recordings, WINDOW_SEC, most=24)
+        coarse_model = WindowModel(scene, recordings, WINDOW_SEC, most=most)
     except DoesNotFit:
         return scene, []
+    fine_model = copy(coarse_model)  # Of the same windows.
+    fine_model.scene, fine_model.simulation = fine, SceneSimulation(fine)
     both = [partial(m.simulate, ()) for m in (coarse_model, fine_model)]
     a, b = side_by_side(both, jobs)
     off = [
@@ -851,7 +859,7 @@ def _settle_step(
     if not np.isfinite(apart).any():  # No window can be simulated with one of them.
         return scene, []
     size = float(np.sqrt(np.nanmean(apart**2)))
-    if size < 1.0 and not _is_mechanism(dynamics, recordings):
+    if size < 1.0 and not is_mechanism:
         return scene, []  # A finer step costs four times as much.
     grave = size >= 0.3
     return fine, [
