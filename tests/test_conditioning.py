@@ -12,6 +12,7 @@ from gap_benchmark.sensing import hermite
 
 from makebreak.gap.data.checks import check_recordings
 from makebreak.gap.data.clock import clock_period, even_clock
+from makebreak.gap.data.command_clock import ticks
 from makebreak.gap.data.conditioning import condition
 from makebreak.gap.data.reading import read_recording
 from makebreak.gap.numerics.signal_noise import estimate_noise, noise_and_jitter
@@ -357,3 +358,15 @@ def test_averages_leave_commands_of_a_loop_their_own_rows(tmp_path):
     at = np.searchsorted(out.time, time + 1e-9, "right") - 1
     last = (time < out.time[-1]) & np.isfinite(command)
     np.testing.assert_allclose(u[at][last], command[last], rtol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_clock_little_slower_than_the_rows_is_found_over_pauses(seed):
+    rng = np.random.default_rng(seed)
+    row, period = 0.004, 0.005 * (1.0 + 2e-5 * rng.normal())
+    at = rng.uniform(0.0, row) + period * np.arange(3000)
+    for first in rng.integers(300, 2700, 4):  # Nothing changes for a while.
+        at = np.delete(at, slice(first, first + 30))
+    shown = row * np.ceil(at / row)
+    found = ticks(shown - row, shown)
+    assert found is not None and np.abs(found - at).max() < 0.3 * row

@@ -18,7 +18,9 @@ from makebreak.gap.data.recording import Episode, Recording
 FEWEST = 20  # Changes that tell a clock.
 SLACK = 0.05  # Of a row: by how much stamps may be off.
 MOVED = 0.05  # Of a row: what is less, on average, needs no rows.
-_ROUNDS = 4
+_OFF = 0.004  # Share by which the mean between changes may be off a period.
+_FARTHER = 1.25  # Times as far ticks are counted at a time.
+_AT_FIRST = 200  # Changes of which ticks are counted at first.
 
 
 def on_command_clock(recording: Recording) -> tuple[Recording, list[Finding]]:
@@ -66,30 +68,52 @@ def ticks(before: np.ndarray, after: np.ndarray) -> np.ndarray | None:
     gap = np.diff(after)
     usual = float(np.median(gap))
     period = float(np.mean(gap[np.abs(gap - usual) < 1.01 * row]))
-    middle = 0.5 * (before + after)
-    k = np.concatenate([[0.0], np.cumsum(np.round(gap / period))])
-    for _ in range(_ROUNDS):
-        (period, phase) = np.polyfit(k, middle, 1)
-        if not period > row * (1.0 + SLACK):  # As fast as the rows: nothing shows.
-            return None
+    # Ticks are counted a little farther at a time, as far as a period is known: between
+    # two changes there may be a pause, and of a period little above the rows' a gap of
+    # two rows may be one tick.
+    some, start = min(_AT_FIRST, len(after)), before[0]
+    period, phase = _rough(before[:some] - start, after[:some] - start, period)
+    while True:
+        middle = 0.5 * (before + after)[:some] - start
         k = np.round((middle - phase) / period)
-    if (np.diff(k) < 0.5).any():
+        # phase + period k <= after + slack, >= before - slack, with the least slack.
+        one = np.ones(some)
+        A = np.block([[one[:, None], k[:, None], -one[:, None]],
+                      [-one[:, None], -k[:, None], -one[:, None]]])  # fmt: skip
+        b = np.concatenate([after[:some] - start, start - before[:some]])
+        free = [(None, None), (0.0, None)]
+        tight = linprog([0.0, 0.0, 1.0], A, b, bounds=[*free, (-row, None)])
+        if tight.status != 0 or tight.x[2] > SLACK * row:
+            return None
+        phase, period = tight.x[:2]
+        if some == len(after):
+            break
+        farther = start + _FARTHER * (after[some - 1] - start)
+        some = max(int(np.searchsorted(after, farther)), some + 1)
+    # As fast as the rows nothing shows.
+    if not period > row * (1.0 + SLACK) or (np.diff(k) < 0.5).any():
         return None
-    # phase + period k <= after + slack, >= before - slack, of times from the first on.
-    n, start = len(k), after[0]
-    one, k = np.ones(n), k - k[0]
-    A = np.block([[one[:, None], k[:, None], -one[:, None]],
-                  [-one[:, None], -k[:, None], -one[:, None]]])  # fmt: skip
-    b = np.concatenate([after - start, start - before])
-    free = [(None, None), (0.0, None)]
-    tight = linprog([0.0, 0.0, 1.0], A, b, bounds=[*free, (0.0, None)])
-    if tight.status != 0 or tight.x[2] > SLACK * row:
-        return None
-    slack = tight.x[2] + 1e-6 * row
-    latest = linprog([-n, -k.sum(), 0.0], A, b, bounds=[*free, (slack, slack)])
+    slack = max(tight.x[2], 0.0) + 1e-6 * row
+    latest = linprog([-some, -k.sum(), 0.0], A, b, bounds=[*free, (slack, slack)])
     if latest.status != 0:
         return None
     return np.minimum(start + latest.x[0] + latest.x[1] * k, after)
+
+
+def _rough(before: np.ndarray, after: np.ndarray, period: float) -> tuple[float, float]:
+    """Period and phase of a clock near a period that has a tick in most intervals; the
+    middle of those that have it in as many."""
+    periods = period * (1.0 + np.linspace(-_OFF, _OFF, 41))
+    phases = np.linspace(0.0, 1.0, 60, endpoint=False)
+    p, turn = (x.ravel() for x in np.meshgrid(periods, phases, indexing="ij"))
+    off = 0.5 * (before + after) / p[:, None] - turn[:, None]
+    off = np.abs(off - np.round(off)) * p[:, None]
+    hits = np.sum(off <= (0.5 + SLACK) * (after - before), axis=1)
+    best = hits == hits.max()
+    centre = np.angle(np.sum(np.exp(2j * np.pi * turn[best]))) / (2.0 * np.pi)
+    off = np.abs(turn[best] - centre - np.round(turn[best] - centre))
+    k = np.flatnonzero(best)[np.argmin(off + np.abs(p[best] / p[best].mean() - 1.0))]
+    return float(p[k]), float(turn[k] * p[k])
 
 
 def changes(held: np.ndarray) -> np.ndarray:
