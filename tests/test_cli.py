@@ -690,3 +690,19 @@ def test_python_m_makebreak_is_the_command():
     assert done.returncode == 2 and done.stdout == ""
     assert done.stderr.startswith("makebreak: unknown experiment no_such_experiment")
     assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("given, taken", [(None, "1"), ("3", "3")])
+def test_a_command_uses_one_thread_a_process_if_nothing_else_is_said(given, taken):
+    code = """if True:
+        import os, sys
+        import makebreak.scripts
+        assert "numpy" not in sys.modules
+        import makebreak.scripts.cli
+        print(os.environ["OMP_NUM_THREADS"])"""
+    env = {k: v for k, v in os.environ.items() if k != "OMP_NUM_THREADS"}
+    env |= {"OMP_NUM_THREADS": given} if given else {}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=env, capture_output=True, text=True
+    )
+    assert done.stdout.strip() == taken, done.stderr
