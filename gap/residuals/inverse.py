@@ -126,7 +126,7 @@ class InverseModel(WhitenedRows):
         for k, (track, white) in enumerate(
             zip(self.tracks, self._whiteners, strict=True)
         ):
-            if on_top or any(self.has["effort_measured"]) and not all(self.by_measured):
+            if on_top:
                 r, motion = self._unmet(k, dynamics, effects, ours, moving)
             else:
                 r, motion = self._unmet_sum(k, dynamics, effects, heavy, ours, moving)
@@ -191,6 +191,11 @@ class InverseModel(WhitenedRows):
                 (where, effect.key),
                 partial(_added_mean, effect, dynamics, motion, bumps),
             )
+        if any(name == "effort_measured" for name, _ in self._other_names()):
+            driven = self._effort_of(
+                (where, path), lambda: self._driven_by(k, motion, effects).effort
+            )
+            motion = replace(motion, effort=driven)
         return r, motion
 
     def _driven_by(self, k: int, motion: Motion, effects) -> Motion:
@@ -248,12 +253,10 @@ class InverseModel(WhitenedRows):
                 )
             if self.has["effort_measured"][i] and not self.by_measured[i]:
                 name = f"{joint}.effort_measured"
-                scale, late, bias = sensing(effects, name)
-                stages = with_lag(track.stages[name], lag_of(effects, name))
-                u = motion.effort[:, i] - self._link_rotor[i] * motion.vd[:, i]
-                at = (track.time - late) / scale
-                u = filtered(stages, track.middle, u, np.minimum(at, track.middle[-1]))
-                out[name] = track.mean_over_rows(track.samples[name] - u - bias)
+                out[name] = self._kept(
+                    (k, name, *(e.key for e in effects if e.kind in SENSED + PATH)),
+                    partial(self._effort_row, track, motion, sensed, i),
+                )
         return out
 
     def _velocity_row(self, track: Track, effects, i: int) -> np.ndarray:
@@ -275,6 +278,16 @@ class InverseModel(WhitenedRows):
         else:
             seen = rate(true)
         return track.mean_over_rows(track.samples[name] - seen - bias)
+
+    def _effort_row(self, track: Track, motion: Motion, effects, i: int) -> np.ndarray:
+        """(n_bumps,) what a measured effort shows beside the one that acts."""
+        name = f"{self.joints[i]}.effort_measured"
+        scale, late, bias = sensing(effects, name)
+        stages = with_lag(track.stages[name], lag_of(effects, name))
+        u = motion.effort[:, i] - self._link_rotor[i] * motion.vd[:, i]
+        at = (track.time - late) / scale
+        u = filtered(stages, track.middle, u, np.minimum(at, track.middle[-1]))
+        return track.mean_over_rows(track.samples[name] - u - bias)
 
     def declared_lag(self, channel: str) -> float:
         """Time constant [s] of the slowest first-order filter that is declared; 0 where
