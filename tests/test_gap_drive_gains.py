@@ -209,3 +209,31 @@ def test_friction_that_a_scene_has_may_hold_a_joint_at_rest(tmp_path):
     assert (known._noises[0]["held"][:, 0] >= 30.0 * rest).all()
     unknown = InverseModel(scene, recordings)
     assert unknown._noises[0]["held"][:, 0].max() < 15.0
+
+
+def test_equations_are_sums_of_effects_beside_measured_efforts(tmp_path):
+    scene, _ = scene_and_log(tmp_path)
+    file = tmp_path / "log.csv"
+    names = file.read_text().split("\n", 1)[0].split(",")
+    rows = np.loadtxt(file, delimiter=",", skiprows=1)
+    more = np.random.default_rng(1).normal(size=(len(rows), 2))
+    names += [f"{joint}.effort_measured" for joint in JOINTS]
+    np.savetxt(
+        file, np.column_stack([rows, more]), "%.9g", ",", header=",".join(names),
+        comments="",
+    )  # fmt: skip
+    model = InverseModel(scene, read_recordings([file]))
+    effects = [
+        Effect("joint_coulomb_friction", [JOINTS[0]], {"coulomb": 0.4}),
+        Effect("rotor_inertia", [JOINTS[1]], {"inertia": 0.02}),
+    ]
+    late = Effect("input_delay", ["d"], {"delay": 0.004})
+    both = [
+        of(0, model.dynamics, [*effects, late], *rest, effects, ())
+        for of, rest in ((model._unmet, ()), (model._unmet_sum, ((),)))
+    ]
+    (one, a), (two, b) = both
+    np.testing.assert_allclose(one, two, atol=1e-9)
+    np.testing.assert_allclose(a.effort, b.effort, atol=1e-12)
+    alone = model.residual(effects)
+    assert np.abs(model.residual([*effects, late]) - alone).max() > 0.1
