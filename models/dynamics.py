@@ -73,6 +73,7 @@ class SceneDynamics:
         self._joint_numbers, self._body_laws = _laws(self.loaded)
         try:  # Compiled: some ten times as fast.
             self._tree: JointTree | None = joint_tree(self.plant)
+            self._tree_laws = joint_laws(self.loaded.effects, self.plant)
         except NoJointTree:
             self._tree = None
         self._carriers: dict = {}
@@ -84,8 +85,9 @@ class SceneDynamics:
         """Effort (n, n_v) for the motion q (n, n_q), v, vd (n, n_v) at the times (n,)
         [s], which are only needed for time-dependent forces."""
         if self._tree is not None and not self._body_laws:
-            laws = joint_laws(self.loaded.effects, self.plant)
-            return tree_dynamics.inverse_dynamics(self._tree, q, v, vd, laws, time)
+            return tree_dynamics.inverse_dynamics(
+                self._tree, q, v, vd, self._tree_laws, time
+            )
         plant, context, forces = self.plant, self._context, self._forces
         n = len(v)
         time = np.zeros(n) if time is None else time

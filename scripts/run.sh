@@ -13,6 +13,5 @@ case "${1:-}" in
     --version | --help | -h) ;;
     *) set -- run "$@" ;;
 esac
-unset PYTHONPATH PYTHONHOME                     # As in setup.sh.
-export OMP_NUM_THREADS="${OMP_NUM_THREADS:-1}" # The matrices are small.
+unset PYTHONPATH PYTHONHOME # As in setup.sh.
 exec "$here/../.venv/bin/makebreak" "$@"

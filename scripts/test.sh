@@ -7,8 +7,8 @@ here="$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")"
 "$here/setup.sh"
 
 cd "$here/.."
-unset PYTHONPATH PYTHONHOME       # As in setup.sh.
-unset PYTHONDONTWRITEBYTECODE     # Or each of the tests' processes reads all sources.
+unset PYTHONPATH PYTHONHOME   # As in setup.sh.
+unset PYTHONDONTWRITEBYTECODE # Or each of the tests' processes reads all sources.
 if [[ $# -eq 0 ]]; then
     # nproc would report OMP_NUM_THREADS, if that is set.
     set -- -n "$(env -u OMP_NUM_THREADS nproc)" --dist loadfile

@@ -74,6 +74,8 @@ def ticks(before: np.ndarray, after: np.ndarray) -> np.ndarray | None:
     some, start = min(_AT_FIRST, len(after)), before[0]
     period, phase = _rough(before[:some] - start, after[:some] - start, period)
     while True:
+        if not period > row * (1.0 + SLACK):  # As fast as the rows: nothing shows.
+            return None
         middle = 0.5 * (before + after)[:some] - start
         k = np.round((middle - phase) / period)
         # phase + period k <= after + slack, >= before - slack, with the least slack.
@@ -85,13 +87,12 @@ def ticks(before: np.ndarray, after: np.ndarray) -> np.ndarray | None:
         tight = linprog([0.0, 0.0, 1.0], A, b, bounds=[*free, (-row, None)])
         if tight.status != 0 or tight.x[2] > SLACK * row:
             return None
-        phase, period = tight.x[:2]
         if some == len(after):
             break
+        phase, period = tight.x[:2]
         farther = start + _FARTHER * (after[some - 1] - start)
         some = max(int(np.searchsorted(after, farther)), some + 1)
-    # As fast as the rows nothing shows.
-    if not period > row * (1.0 + SLACK) or (np.diff(k) < 0.5).any():
+    if (np.diff(k) < 0.5).any():
         return None
     slack = max(tight.x[2], 0.0) + 1e-6 * row
     latest = linprog([-some, -k.sum(), 0.0], A, b, bounds=[*free, (slack, slack)])

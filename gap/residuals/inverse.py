@@ -178,13 +178,19 @@ class InverseModel(WhitenedRows):
         weights = () if dynamics is self.dynamics else tuple(e.key for e in heavy)
         where = (k, tuple(e.key for e in moving), weights)
 
+        path = tuple(e.key for e in effects if e.kind in SENSED + PATH)
+
+        def driven() -> np.ndarray:
+            return self._effort_of(
+                (where, path), lambda: self._driven_by(k, motion, effects).effort
+            )
+
         def rest() -> np.ndarray:
             needed = self._moved_by(k, moving)[1]
             if dynamics is not self.dynamics:
                 needed = motion.effort - dynamics.residual(motion)
-            return bumps.mean(self._driven_by(k, motion, effects).effort - needed)
+            return bumps.mean(driven() - needed)
 
-        path = tuple(e.key for e in effects if e.kind in SENSED + PATH)
         r = self._kept((where, path), rest)
         for effect in ours:
             r = r - self._kept(
@@ -192,10 +198,7 @@ class InverseModel(WhitenedRows):
                 partial(_added_mean, effect, dynamics, motion, bumps),
             )
         if any(name == "effort_measured" for name, _ in self._other_names()):
-            driven = self._effort_of(
-                (where, path), lambda: self._driven_by(k, motion, effects).effort
-            )
-            motion = replace(motion, effort=driven)
+            motion = replace(motion, effort=driven())
         return r, motion
 
     def _driven_by(self, k: int, motion: Motion, effects) -> Motion:
