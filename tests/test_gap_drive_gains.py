@@ -237,3 +237,22 @@ def test_equations_are_sums_of_effects_beside_measured_efforts(tmp_path):
     np.testing.assert_allclose(a.effort, b.effort, atol=1e-12)
     alone = model.residual(effects)
     assert np.abs(model.residual([*effects, late]) - alone).max() > 0.1
+
+
+@pytest.mark.parametrize("i", range(2))
+def test_what_is_fed_back_late_is_damping_and_a_rotor_that_are_not_there(tmp_path, i):
+    scene, recordings = scene_and_log(tmp_path)
+    model = InverseModel(scene, recordings)
+    columns, _, names = model.loop_timing()
+    late = 1e-3  # [s]
+    for fed_back, effect in (
+        ("position", Effect("joint_viscous_damping", [JOINTS[i]],
+                            {"damping": late * KP[i]})),
+        ("velocity", Effect("rotor_inertia", [JOINTS[i]], {"inertia": late * KD[i]})),
+    ):  # fmt: skip
+        column = columns[
+            names.index(f"input_delay of {JOINTS[i]}, loop of its {fed_back}")
+        ]
+        off = (model.base() - model.residual([effect])) / late
+        np.testing.assert_allclose(column, off, atol=1e-6 * np.abs(off).max())
+        assert np.abs(off).max() > 1.0
