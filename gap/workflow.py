@@ -304,8 +304,7 @@ def _compared(
             then = select(other, say)
         with budget.part(CONCLUDE):
             named = conclude(other, then, reported, [*checks, *found], jobs)
-        unnamed = named.verdict in ("gap_unnamed", "not_judged")
-        if unnamed and not named.gap.reduction > result.gap.reduction:
+        if not explains_more(named, result):
             return first
         searched.undone[:] = own.undone
         return other, then, named
@@ -449,6 +448,14 @@ def _contact_problem(
 ) -> tuple[ContactProblem, list[Finding]]:
     contact = contact_problem(scene, recordings)
     return contact, sap_lift(contact) + point_on_face(contact, contact.lying())
+
+
+def explains_more(one: GapResult, other: GapResult) -> bool:
+    """Whether a result is to be taken in the place of one that leaves a gap without a
+    name: it leaves none, or it closes more of what its simulated windows show."""
+    if one.verdict in ("gap_unnamed", "not_judged"):
+        return one.gap.reduction > other.gap.reduction
+    return True
 
 
 def nothing_compared(checks: Sequence[Finding]) -> GapResult:

@@ -1295,6 +1295,52 @@ def test_the_steady_error_is_without_the_loudest_block():
     assert GapProblem.steady_error(problem, fitted) == 4.0  # Of three blocks.
 
 
+@pytest.mark.parametrize(
+    "verdict, after, taken",
+    [("gap_named", 9.0, True), ("gap_unnamed", 5.0, True), ("gap_unnamed", 9.0, False),
+     ("not_judged", float("nan"), False)],
+)  # fmt: skip
+def test_another_comparison_counts_where_it_closes_more(verdict, after, taken):
+    one, other = (
+        SimpleNamespace(verdict=v, gap=windows_leave(10.0, x))
+        for v, x in ((verdict, after), ("gap_unnamed", 8.0))
+    )
+    assert workflow.explains_more(one, other) == taken
+
+
+def test_slopes_follow_what_a_step_did_while_it_is_nearly_what_they_said():
+    asked = []
+
+    def bent_by(bend, z):
+        asked.append(np.array(z))
+        x, y = z
+        return np.array([x + 0.02 * x**2, 2.0 * y, x * y * bend, 1.0])
+
+    problem = SimpleNamespace(
+        apart=lambda start, names: [], plan=SimpleNamespace(diff_step=1e-6),
+        prior_rows=lambda effects: np.zeros(0),
+    )  # fmt: skip
+    free = SimpleNamespace(
+        start=[None], names=((0, "x"), (0, "y")), high=np.full(2, np.inf),
+        scale=np.ones(2), effects=lambda z: z,
+    )  # fmt: skip
+    for bend, anew in ((0.0, False), (5.0, True)):
+        residual = partial(bent_by, bend)
+        slopes = fit._Slopes(problem, free, residual, residual, lambda r: r)
+        there, then = np.array([1.0, 1.0]), np.array([1.5, 2.0])
+        first = slopes(there)
+        asked.clear()
+        J = slopes(then)
+        assert (len(asked) > 1) == anew
+        if anew:
+            exact = [[1.06, 0.0], [0.0, 2.0], [5.0 * 2.0, 5.0 * 1.5], [0.0, 0.0]]
+            np.testing.assert_allclose(J, exact, atol=1e-4)
+        else:  # The secant's condition (Broyden 1965).
+            change = residual(then) - residual(there)
+            np.testing.assert_allclose(J @ (then - there), change, atol=1e-9)
+            assert not slopes.are_exact and not np.allclose(J, first)
+
+
 class TwoJoints(MechanismProblem):
     """What is left of two joints' equations and of a velocity, in units of noise."""
 
