@@ -263,6 +263,17 @@ def test_positions_that_count_from_the_logs_start_are_asked_about(tmp_path):
     assert "count from where the log" in found["position_from_start"]
 
 
+def test_a_servo_that_sets_out_at_its_command_took_no_offset(tmp_path):
+    """Its efforts begin at 0, and are a little off afterwards; the weight is there."""
+
+    def sets_out(columns):
+        for name in [n for n in columns if n.endswith("effort")]:
+            columns[name] = columns[name] + 0.5 * np.std(columns[name])
+            columns[name][0] = 0.0
+
+    assert "effort_tared" not in judged(tmp_path, sets_out)
+
+
 def test_efforts_of_another_motion_are_said_to_explain_nothing(tmp_path):
     def other(columns):
         for name in [n for n in columns if n.endswith("effort")]:

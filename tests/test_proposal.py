@@ -607,3 +607,57 @@ def test_the_unit_in_a_name_is_no_matter_of_size():
     names = ("mast position [mm]", "mast speed [m/s]")
     [_, q, v] = propose({"time": T} | sines(names, 100.0), joints)
     assert (q.scale, v.scale) == (1e-3, 1.0)
+
+
+def servo_log(tmp_path, kp, kd, given, gravity=0.0):
+    """A wheel of 0.2 kg m2 in MJCF with a position servo, and a log of positions,
+    commands that step each 20 ms and efforts `given(error, rate)`, with a weight's
+    moment `gravity` [N m] beside it."""
+    robot = tmp_path / "one.xml"
+    robot.write_text(
+        '<mujoco model="one"><compiler angle="radian"/><worldbody><body name="link">'
+        '<joint name="j" axis="0 1 0" range="-2 2" armature="0.1"/>'
+        '<inertial pos="0 0 0" mass="1" diaginertia="0.2 0.2 0.2"/></body></worldbody>'
+        f'<actuator><position joint="j" kp="{kp}" kv="{kd}"/></actuator></mujoco>'
+    )
+    t = 0.002 * np.arange(6000)
+    q = np.sin(2.0 * t) + 0.2 * np.sin(7.0 * t)
+    v = 2.0 * np.cos(2.0 * t) + 1.4 * np.cos(7.0 * t)
+    held = q[10 * (np.arange(6000) // 10)] + 0.05 * np.cos(3.0 * t)
+    rows = {"time": t, "j_pos": q, "j_vel": v, "j_cmd_pos": held}
+    if given is not None:
+        rows["j_effort"] = given(held - q, v) + gravity * np.sin(q)
+    log = tmp_path / "log.csv"
+    np.savetxt(log, np.stack([*rows.values()], 1), delimiter=",",
+               header=",".join(rows), comments="")  # fmt: skip
+    proposal = propose_scene(read_robot(robot), [read_log(log)])
+    (tmp_path / "scene.yaml").write_text(proposal.scene)
+    return read_scene(tmp_path / "scene.yaml"), proposal.sidecars[log]
+
+
+@pytest.mark.parametrize("own", [(80.0, 3.0), (120.0, 0.5)])
+def test_efforts_that_are_what_a_servo_gives_tell_its_gains(tmp_path, own):
+    """Of the file's servo those of the file, of another one its own. Their samples do
+    not tell what acts between rows, and the servo does."""
+    kp, kd = own
+    scene, sidecar = servo_log(tmp_path, 80.0, 3.0, lambda e, v: kp * e - kd * v)
+    assert scene.actuation.type == "servo"
+    # kd from rates averaged over 0.2 s; the gains in the text have three digits.
+    assert scene.actuation.kp == pytest.approx([kp], rel=0.01)
+    assert scene.actuation.kd == pytest.approx([kd], rel=0.05)
+    assert '"j_effort": null' in sidecar or "j_effort: null" in sidecar
+
+
+def test_efforts_that_a_servo_does_not_give_drive_the_joints(tmp_path):
+    scene, sidecar = servo_log(
+        tmp_path, 80.0, 3.0, lambda e, v: 80.0 * e - 3.0 * v, gravity=4.0
+    )
+    assert scene.actuation.type == "effort"
+    assert "one.j.effort_measured" in sidecar
+
+
+def test_a_drive_that_stops_its_joint_within_a_millisecond_has_a_shorter_step(tmp_path):
+    scene, _ = servo_log(tmp_path, 4500.0, 450.0, None)
+    # 0.2 kg m2 and a rotor of 0.1: 0.67 ms.
+    assert scene.plant.time_step == 0.0005
+    load_scene(scene, DiagramBuilder())  # At 1 ms it refuses.

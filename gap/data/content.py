@@ -760,14 +760,22 @@ def _tared(contents: Contents, matches, said) -> list[Match]:
     means = np.less([abs(np.mean(y)) / WEIGHS for y in raw.values()], sizes)
     if max(starts.sum(), means.sum()) < 0.8 * max(len(raw), 1):
         return matches
-    off, most = {}, 0.0
+    needed, off = contents.needed, {}
     for i in raw:
         m, told = of[efforts[i]], contents.told(efforts[i], i)
         if told.left < 1.0 - EXPLAINS:
             off[i] = told.bias - told.factor * m.offset / m.scale
-            size = np.sqrt(np.mean(contents.needed[:, i] ** 2))
-            most = max(most, abs(off[i]) / max(size, 1e-300))
-    if most < WEIGHS or 2 * len(off) < len(raw):
+    size = np.maximum(np.sqrt(np.mean(needed**2, axis=0)), 1e-300)[list(off)]
+    share = np.array(list(off.values())) / size
+    # A servo that sets out from where it was told to be begins at 0, too: then what is
+    # needed there, or on average, is not missing afterwards.
+    taken = needed[0] if starts.sum() >= means.sum() else needed.mean(axis=0)
+    missing = np.linalg.norm(share - taken[list(off)] / size)
+    if (
+        2 * len(off) < len(raw)
+        or np.abs(share).max(initial=0.0) < WEIGHS
+        or missing > 0.5 * np.linalg.norm(share)
+    ):
         return matches
     which = ", ".join(efforts[i] for i in off)
     says = (

@@ -5,7 +5,7 @@ units.py says what columns count in.
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 import yaml
@@ -139,9 +139,15 @@ def said_of(columns: Mapping) -> dict[str, Match]:
     return found
 
 
-def of_one_drive(matches: Sequence[Match]) -> list[Match]:
+def of_one_drive(
+    matches: Sequence[Match], of_servos: Collection[str] = ()
+) -> list[Match]:
     """With one kind of command alone: efforts before positions, and before velocities;
-    measured efforts stand in for commands of effort."""
+    measured efforts stand in for commands of effort. of_servos: channels of measured
+    efforts that are what the position commands' servos give."""
+    why = "what its position servo gives, and so no other drive"
+    matches = [Match(m.column, None, why=why) if m.channel in of_servos else m
+               for m in matches]  # fmt: skip
     kinds = {
         m.channel.rsplit(".", 1)[1] for m in matches if m.channel and "." in m.channel
     }

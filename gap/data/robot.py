@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
@@ -49,6 +50,7 @@ from makebreak.gap.data.servo_gains import (
     ServoGains,
     ServoLog,
     effort_shares,
+    gains_of_efforts,
     servo_gains,
 )
 from makebreak.gap.data.sidecar import Found, read_sidecars, sidecar_for
@@ -59,6 +61,7 @@ from makebreak.gap.data.table import (
 )
 from makebreak.gap.data.units import DEG, FULL_RANGE, said_of_units
 from makebreak.models.effects import KINDS
+from makebreak.models.effects.actuation_path import FASTEST
 from makebreak.models.effects.joints import ROTOR
 from makebreak.models.effects.kind import actuator_of, one_dof_joints
 from makebreak.models.fixed_joints import couplings_in, fix_joints
@@ -291,6 +294,7 @@ BASE_MOVES = "base_moves"
 NO_ACTUATION = ["actuation: {type: none}"]
 FROM_SAG = "from how far joints sag below their commands"
 FROM_MOTION = "from how joints followed their commands"
+FROM_EFFORTS = "from the measured efforts, which are what such servos give"
 
 
 @dataclass(frozen=True)
@@ -372,13 +376,15 @@ class Proposal:
 class Judged:
     """Logs' columns by their names and by what is in them. robot: without joints that
     are taken to stand still, fixed {joint: where}. unused: columns of quantities of
-    unknown joints. said: what contents say beside names."""
+    unknown joints. said: what contents say beside names. servos: {joint: gains} where
+    the measured efforts are what position servos give."""
 
     robot: Robot
     every: dict[Path, list[Match]]
     fixed: dict[str, float]
     unused: tuple[str, ...]
     said: tuple[Said, ...]
+    servos: Mapping[str, ServoGains] = field(default_factory=dict)
 
 
 def judge_logs(robot: Robot, logs: Sequence[Log]) -> Judged:
@@ -415,9 +421,27 @@ def judge_logs(robot: Robot, logs: Sequence[Log]) -> Judged:
         matches, more = by_content(
             robot.plant, robot.joints, log.table.columns, every[log.path]
         )
-        every[log.path] = of_one_drive(matches)
+        every[log.path] = matches
         said += [each for each in more if each not in said]
-    return Judged(robot, every, fixed, tuple(unused), tuple(said))
+    servos = _servos_of_efforts(robot, every, logs)
+    given = [f"{joint}.effort_measured" for joint in servos]
+    every = {path: of_one_drive(matches, given) for path, matches in every.items()}
+    return Judged(robot, every, fixed, tuple(unused), tuple(said), servos)
+
+
+def _servos_of_efforts(robot: Robot, every, logs) -> dict[str, ServoGains]:
+    """{joint: gains} where all measured efforts are what position servos give: these
+    tell what acts between the rows, too, where a step of a command has its effect."""
+    motions, drives = _motions(robot, every, logs), robot.file.drives
+    if not motions:
+        return {}
+    of_file = [drives.get(j.name.partition(".")[2]) for j in robot.joints]
+    known = [
+        (own.kp, own.kd) if own is not None and own.kp else None for own in of_file
+    ]
+    found = gains_of_efforts(motions, known)
+    return {joint.name: own for joint, own in zip(robot.joints, found, strict=True)
+            if own is not None} if None not in found else {}  # fmt: skip
 
 
 def _numbered(robot: Robot, logs: Sequence[Log], said: list[Said]) -> Robot:
@@ -527,14 +551,14 @@ def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
             f"fixed_joints: {{{where}}}  # Not in the log, or coupled (mimic)."
         )
         notes.append(f"{', '.join(fixed)} {_stands(fixed)}")
-    actuation, gains = _actuation(robot, kinds, every, logs, notes)
+    actuation, gains = _actuation(robot, kinds, judged.servos, every, logs, notes)
     if actuation == NO_ACTUATION:
         _check_currents(every, robot, logs)
     gravity = list(robot.file.gravity)
     if any(each.kind == WITHOUT_WEIGHT for each in judged.said):
         gravity = [0.0, 0.0, 0.0]
     own = "" if gravity == [0.0, 0.0, -9.81] else f", gravity: {gravity}"
-    lines += [f"plant: {{time_step: 0.001{own}}}", *actuation]
+    lines += [f"plant: {{time_step: {_time_step(robot, actuation)}{own}}}", *actuation]
     lines += _effects_of_file(robot, fixed, lines)
     said = judged.said
     apart = overlapping("\n".join(lines) + "\n", copies, [
@@ -735,7 +759,7 @@ def _file(robot: Robot) -> str:
 
 
 def _actuation(
-    robot: Robot, kinds, every, logs, notes: list[str]
+    robot: Robot, kinds, servos, every, logs, notes: list[str]
 ) -> tuple[list[str], str]:
     """Lines of the scene, and how drives' gains were guessed ("": there are none)."""
 
@@ -760,11 +784,12 @@ def _actuation(
             f"no column says what drives {', '.join(rest)}: in this scene nothing does"
         )
     if joints := named("position_command"):
-        gains = _gains_by_motion(robot, every, logs)
-        stiff = _stiffness(robot, every, logs)
+        gains = servos or _gains_by_motion(robot, every, logs)
+        stiff = {} if servos else _stiffness(robot, every, logs)
         stiff |= {joint: own.kp for joint, own in gains.items()}
         file = {f"{robot.model}.{j}": d for j, d in robot.file.drives.items() if d.kp}
-        if all(joint in file for joint in joints):
+        own = servos or file
+        if all(j in file and own[j].kp == file[j].kp for j in joints):
             return _servos_of_file(robot, joints, file, notes), ""
         known = [k for k in stiff.values() if k > 0.0]
         guess = float(np.median(known)) if known else GUESSED_KP
@@ -774,14 +799,15 @@ def _actuation(
             for j, k in zip(joints, kp, strict=True)
         ]
         every_one = all(joint in gains for joint in joints)
-        told = FROM_MOTION if every_one else FROM_SAG if known else "a guess"
+        by_motion = FROM_EFFORTS if servos else FROM_MOTION
+        told = by_motion if every_one else FROM_SAG if known else "a guess"
         notes.append(f"drives are position servos of kp {kp} N m/rad ({told})")
         lines = [
             "actuation:",
             "  type: servo  # Gains are guessed: correct them.",
             f"  joints: [{', '.join(joints)}]",
             f"  kp: {kp}  # [N m/rad], {told}.",
-            f"  kd: {kd}  # [N m s/rad], {FROM_MOTION if every_one else 'a guess'}.",
+            f"  kd: {kd}  # [N m s/rad], {by_motion if every_one else 'a guess'}.",
         ]
         limits = [robot.effort_limits.get(j, np.inf) for j in joints]
         if all(0.0 < limit < 1e6 for limit in limits):
@@ -837,6 +863,16 @@ def _servos_of_file(robot: Robot, joints, drives, notes: list[str]) -> list[str]
     ]
 
 
+def _time_step(robot: Robot, actuation: Sequence[str]) -> float:
+    """[s] A millisecond, or less where a drive stops its joint faster than that."""
+    drives = yaml.safe_load("\n".join(actuation))["actuation"]
+    moved, step = _inertia(robot), 1e-3
+    for joint, kd in zip(drives.get("joints", ()), drives.get("kd", ()), strict=False):
+        while moved[joint] < kd * step and step > 0.5 / FASTEST:
+            step *= 0.5
+    return step
+
+
 def _inertia(robot: Robot) -> dict[str, float]:
     """{joint: inertia [kg m2], or mass [kg], that it moves in the pose of zeros while
     all other joints are free}."""
@@ -887,13 +923,15 @@ def _motions(robot: Robot, every, logs) -> list[ServoLog]:
         time = channels["time"]
         q = np.stack([channels[f"{j.name}.position"] for j in robot.joints], axis=1)
         none = np.full(len(time), np.nan)
-        told = [
-            _held(channels.get(f"{j.name}.position_command", none))
-            for j in robot.joints
-        ]
+        told, effort = (
+            np.stack([read(channels.get(f"{j.name}.{what}", none))
+                      for j in robot.joints], axis=1)
+            for what, read in (("position_command", _held),
+                               ("effort_measured", np.asarray))
+        )  # fmt: skip
         good = np.isfinite(q).all(axis=1) & np.isfinite(time)
         good &= np.diff(time, prepend=-np.inf) > 0.0
-        motions.append(ServoLog(time[good], q[good], np.stack(told, axis=1)[good]))
+        motions.append(ServoLog(time[good], q[good], told[good], effort[good]))
     return motions
 
 

@@ -1,8 +1,9 @@
 """The gains of position servos, from how joints moved and what they were told.
 
-A servo gives kp (command - position) - kd velocity, and the robot needs what inverse
-dynamics says. Both are averaged by one kernel and compared by least squares, with dry
-friction and a rotor free, so that neither is taken for a gain.
+A servo gives kp (command - position) - kd velocity. Where measured efforts are just
+that, they tell the gains. Else the robot needs what inverse dynamics says. Both are
+averaged by one kernel and compared by least squares, with dry friction and a rotor
+free, so that neither is taken for a gain.
 """
 
 from collections.abc import Sequence
@@ -23,6 +24,7 @@ MOVES = 0.05  # Of its fastest: slower, a joint may be held by friction.
 PARTS = 5  # Of the data: each is predicted from the others,
 LARGEST_SPREAD = 0.15  # whose stiffnesses differ by less than this share (1 sigma),
 LEAST_EXPLAINED = 0.8  # and of what the rest leaves the stiffness explains this.
+LAW_LEAVES = 0.01  # Of the variance of an effort that is what its servo gives.
 
 
 @dataclass(frozen=True)
@@ -39,11 +41,12 @@ class ServoGains:
 @dataclass(frozen=True, eq=False)
 class ServoLog:
     """One log: time (n,) [s], positions q (n, n_q) and position commands (n, n_q), NaN
-    where there is none, as each is held from its row on."""
+    where there is none, as each is held from its row on. effort: (n, n_q) measured."""
 
     time: np.ndarray
     q: np.ndarray
     command: np.ndarray
+    effort: np.ndarray | None = None
 
 
 def servo_gains(
@@ -72,6 +75,56 @@ def servo_gains(
         if found[i] is None and alike:
             found[i] = _fitted_at(float(np.median(alike)), own)
     return found
+
+
+def gains_of_efforts(
+    motions: Sequence[ServoLog], known: Sequence[tuple[float, float] | None]
+) -> list[ServoGains | None]:
+    """Of each joint, where its measured effort is kp (command - position) - kd velocity
+    and nothing else, as of simulated servos and of motors that report what they were
+    told to give. None of the others.
+
+    Args: known: kp and kd of the robot's file: they are taken where they fit as well.
+    """
+    parts: list[list] = [[] for _ in known]
+    for motion in motions:
+        averaged = averaged_motion(motion)
+        if averaged is None or motion.effort is None:
+            return [None] * len(parts)
+        even, _, _, (kernel, *_), (mean, rate, rate2) = averaged
+        for i, own in enumerate(parts):
+            # Both as they are in their rows: between these a step of the command
+            # changes them alike. An acceleration is the rate half a row later.
+            told, effort = (
+                np.convolve(np.interp(even, motion.time, y[:, i]), kernel, "valid")
+                for y in (motion.command, motion.effort)
+            )
+            X = [told - mean[:, i], -rate[:, i], rate2[:, i], -rate2[:, i]]
+            own.append((np.stack(X, axis=1), effort))
+    found = [_law(*each) for each in zip(parts, known, strict=True)]
+    others = [(own.kp, own.kd) for own in found if own is not None]
+    for i, own in enumerate(parts):  # Of one that tells no gains, those of another.
+        for other in others if found[i] is None else ():
+            found[i] = found[i] or _law(own, other)
+    return found
+
+
+def _law(parts: Sequence[tuple[np.ndarray, np.ndarray]], known) -> ServoGains | None:
+    """From error, rate and acceleration, twice, (m, 4) and effort (m,) of each log."""
+    if not parts:
+        return None
+    X, y = (np.concatenate(each) for each in zip(*parts, strict=True))
+    if not (np.isfinite(X).all() and np.isfinite(y).all() and np.ptp(y) > 0.0):
+        return None
+    most = LAW_LEAVES * np.var(y) * len(y)
+    if known is not None and nnls(X[:, 2:], y - X[:, :2] @ known)[1] ** 2 < most:
+        return ServoGains(known[0], known[1], 0.0, 0.0)
+    size = np.maximum(np.sqrt(np.mean(X**2, axis=0)), 1e-12)
+    c, left = nnls(X / size, y)
+    kp, kd, *_ = c / size
+    if left**2 > most or nnls(X[:, 2:], y)[1] ** 2 < most:  # A rotor alone would do.
+        return None
+    return ServoGains(float(kp), float(kd), 0.0, 0.0)
 
 
 def _joints(plant: MultibodyPlant) -> list:
