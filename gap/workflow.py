@@ -208,13 +208,15 @@ def _run(
     go_on()
     checks += check_recordings(parts.decided, scene_facts(dynamics.plant))
     checks += check_tool_weight(dynamics, parts.decided)
-    checks += check_contents(dynamics.plant, parts.decided)
-    checks += check_untold(scene, parts.decided)
     is_mechanism = _is_mechanism(dynamics, recordings)
+    pushes = is_mechanism and push_each_other(dynamics, parts.decided)
+    checks += check_contents(dynamics.plant, parts.decided, pushes)
+    checks += check_untold(scene, parts.decided)
     # An impact would be smeared by means over rows.
-    meets = is_mechanism and any(
-        asked(dynamics, parts.decided)
-        for asked in (runs_against, presses, push_each_other)
+    meets = (
+        pushes
+        or is_mechanism
+        and any(asked(dynamics, parts.decided) for asked in (runs_against, presses))
     )
     seconds["checks"] = clock.lap()
     limbs = limbs_of(dynamics, parts.decided) if is_mechanism and not meets else []

@@ -668,6 +668,7 @@ def test_what_is_seen_in_two_blocks_is_fitted_and_held_out():
     model = SimpleNamespace(
         means=SimpleNamespace(time=time, episode=np.zeros(len(time), int)),
         _shown=np.ones(r.shape, bool),
+        half=0.05,
     )
     ContactProblem._share_out(model, r)
     train = model._train
@@ -675,6 +676,13 @@ def test_what_is_seen_in_two_blocks_is_fitted_and_held_out():
     assert train[loud].mean() == pytest.approx(0.5, abs=0.1)
     for block in np.unique(model._block):  # Neighbours err together.
         assert len(set(train[model._block == block])) == 1
+    # Of one push, less than a block long, too.
+    r[:] = 1.0
+    loud = (time > 3.0) & (time < 3.6)
+    r[loud, 1] = 50.0
+    ContactProblem._share_out(model, r)
+    assert model._train[loud].mean() == pytest.approx(0.5, abs=0.1)
+    assert model._train.mean() == pytest.approx(2 / 3, abs=0.05)
 
 
 @pytest.mark.slow
@@ -823,7 +831,7 @@ def test_windows_expect_what_the_noise_of_measured_efforts_makes(monkeypatch):
     class Windows(PushWindows):
         def __init__(self):
             act = SimpleNamespace(type="effort", joints=["a"])
-            self.scene = SimpleNamespace(actuation=act)
+            self.scene = SimpleNamespace(actuation=act, effects=[])
             channel = SimpleNamespace(name="a.effort_measured", noise=noise)
             episode = SimpleNamespace(first=0, rows=slice(0, 30))
             self.recordings = [Recorded(time, {channel.name: (channel, y)}, [episode])]

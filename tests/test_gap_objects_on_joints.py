@@ -10,6 +10,7 @@ import pytest
 
 from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.residuals.contact_problem import ContactProblem
+from makebreak.gap.residuals.impacts import walls_of
 from makebreak.gap.residuals.pressing import push_each_other
 from makebreak.gap.workflow import problem_for, run_gap
 from makebreak.models.dynamics import SceneDynamics
@@ -137,6 +138,48 @@ def test_the_mass_of_a_block_on_a_rail_is_named(tmp_path, rng, factor):
     (effect,) = result.effects
     assert (effect.kind, effect.at) == ("object_mass", ("block.body",))
     assert effect.parameters["mass"].value == pytest.approx(MASS, rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "motors", "counts"),
+    [(0.15, "finger.x", True), (0.05, "finger.x", False),
+     (0.15, "finger.x, block.x", False)],
+)  # fmt: skip
+def test_one_short_push_of_an_object_counts(tmp_path, seconds, motors, counts):
+    """If means fit in. What has a motor of its own is no object: limbs pass by."""
+    scene = write_scene(tmp_path, MASS)
+    scene.write_text(SCENE.replace("[finger.x]", f"[{motors}]"))
+    t = np.arange(0.0, 10.0, 0.002)
+    apart = np.where((t > 5.0) & (t < 5.0 + seconds), 0.0, 0.05)
+    x = np.column_stack([t, np.zeros(len(t)), RADIUS + HALF + apart])
+    file = tmp_path / "log.csv"
+    header = "time,finger.x.position,block.x.position"
+    np.savetxt(file, x, delimiter=",", header=header, comments="")
+    dynamics = SceneDynamics(read_scene(scene))
+    assert push_each_other(dynamics, read_recordings([file])) is counts
+
+
+def test_the_ground_in_a_robots_own_file_is_no_part_of_its_base(tmp_path):
+    """A pedestal is, on which a joint's parent is welded."""
+    box = SHAPE.format("box", "<box><size>0.1 0.1 0.1</size></box>")
+    fixed = (
+        '<joint name="{1}_at" type="fixed"><parent>{0}</parent><child>{1}</child>'
+        "</joint>"
+    )
+    for parent, is_wall in (("world", True), ("base", False)):
+        text = (
+            '<link name="base"/>' + LINK.format("arm", 0.0, 1.0, box)
+            + LINK.format("other", 1.0, 1.0, box) + JOINT.format("base", "arm", 0, "")
+            + fixed.format("world", "base") + fixed.format(parent, "other")
+        )  # fmt: skip
+        (tmp_path / "robot.sdf").write_text(SDF.format("robot", text))
+        scene = tmp_path / "scene.yaml"
+        scene.write_text(
+            "directives:\n  - add_model: {name: robot, file: robot.sdf}\n"
+            "actuation: {type: effort, joints: [robot.x]}\n"
+        )
+        walls = walls_of(SceneDynamics(read_scene(scene)))
+        assert (walls is not None) is is_wall
 
 
 def test_shapes_of_links_that_one_joint_moves_often_overlap(tmp_path, rng):

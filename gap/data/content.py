@@ -1084,10 +1084,11 @@ def told_by(contents: Contents, matches: Sequence[Match]) -> dict[str, Likeness]
 
 
 def check_contents(
-    plant: MultibodyPlant, recordings: Sequence[Recording]
+    plant: MultibodyPlant, recordings: Sequence[Recording], pushes: bool = False
 ) -> list[Finding]:
     """What channels' contents say against their names: until that is put right, an
-    effect would only make up for it."""
+    effect would only make up for it. pushes: whether links push each other, so that
+    efforts are other than the motion alone needs: of them nothing is sure then."""
     joints = [
         JointName(
             full_name(plant, j),
@@ -1110,6 +1111,8 @@ def check_contents(
                     f"scale: {each.size:.6g}}}}}"
                 )
             severity = _SEVERITY.get(each.kind, "error")
+            if pushes and ".effort_" in each.channel:
+                severity = "warning"
             found.append(
                 Finding(each.kind, r.name, each.channel, each.size, "", severity, says)
             )

@@ -350,15 +350,16 @@ class ContactDynamics(PermittedContacts):
         return more
 
     def _held(self, effects: Sequence[Effect]) -> np.ndarray:
-        """(K, n_v) by how much friction of the joints may be off its law: at rest it is
-        anything between what it is while they move one way and the other."""
+        """(K, n_v) by how much friction of the joints, the scene's and that of effects,
+        may be off its law: at rest it is anything between what it is while they move
+        one way and the other."""
         motion, found = self._node_motion, np.zeros_like(self._node_v)
         slow = np.full_like(motion.v, REST_SPEED)
-        for e in effects:
+        for e in (*self.scene.effects, *effects):
             if KINDS[e.kind].joint_law is not None:
                 ways = (self._added(e, replace(motion, v=v)) for v in (slow, -slow))
-                found += 0.5 * np.abs(np.subtract(*ways))
-        return self._W @ (found * (np.abs(motion.v) < REST_SPEED))
+                found += 0.5 * np.subtract(*ways)
+        return self._W @ (np.abs(found) * (np.abs(motion.v) < REST_SPEED))
 
     def _unbiased(self, wrench: np.ndarray, effects: Sequence[Effect]) -> np.ndarray:
         """(K, n_wrench) wrenches without the biases that effects give their sensors."""

@@ -218,13 +218,13 @@ class ContactProblem(ContactCandidates, GapProblem):
         r = self._in_table(left)
         n = len(self.allowance)
         held = ~self._train if not self._train.all() else self._train
-        off = np.abs(self.in_newtons(r[:, :n])[held])
-        size = ROBUST * np.median(off, axis=0)
-        # Where forces take up most rows, the median of what is left says little.
-        size = np.maximum(
-            size, 0.6 * np.sqrt(np.mean(np.minimum(off, 4 * size) ** 2, axis=0))
+        sensors, off = self.sensor_std(), np.abs(self.in_newtons(r[:, :n]))
+        # What dry friction holds at rest says nothing of laws.
+        told = np.ones(off.shape, bool)
+        told[:, : len(self.coordinates)] = (
+            self._held(()) < sensors[: len(self.coordinates)]
         )
-        sensors = self.sensor_std()
+        size = np.array([_size(off[held & told[:, k], k]) for k in range(n)])
         beside = np.sqrt(np.maximum(size**2 - (MISFIT * sensors) ** 2, 0.0))
         off = np.maximum(beside, LEAST_MISFIT * self.acting)
         for sensor in self.sensors:
@@ -676,6 +676,15 @@ class ContactProblem(ContactCandidates, GapProblem):
             unexplained_in_windows(model, after),
             where=where_in_windows(model, model.errors(before)) if recordings else (),
         )
+
+
+def _size(off: np.ndarray) -> float:
+    """Of deviations (m,) what most of them are like; 0 of none. Where forces take up
+    most rows, the median of what is left says little."""
+    if not len(off):
+        return 0.0
+    size = ROBUST * np.median(off)
+    return max(size, 0.6 * rms(np.minimum(off, 4.0 * size)))
 
 
 def _felt_by(sensor: WrenchSensor) -> str:

@@ -13,6 +13,7 @@ from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 
 BLOCK_SEC = 0.6  # In which a tool goes a few centimetres.
+ONE_BLOCK = 0.5  # Of the squares that are left: more, and it is most of them.
 
 
 class ContactRows(FeltWalls):
@@ -74,19 +75,19 @@ class ContactRows(FeltWalls):
         """Which blocks are fitted, by what the scene leaves (rows as `_shown`). What is
         seen at one place alone (a patch, a wall) is seen in few blocks, and must be in
         both parts: so of each three blocks of which about as much is left, the middle
-        one is held out."""
-        m = self.means
-        block = np.zeros(len(m.time), int)
-        first = 0
-        for number in np.unique(m.episode):
-            mine = m.episode == number
-            start = m.time[mine].min()
-            block[mine] = first + ((m.time[mine] - start) / BLOCK_SEC).astype(int)
-            first = int(block[mine].max()) + 1
-        self._block = block
-        _, order = np.unique(block, return_inverse=True)
+        one is held out. Blocks are shorter, but hold two test functions side by side,
+        where one has most of it."""
         size = np.sum(np.where(self._shown, left**2, 0.0), axis=1)
-        total = np.bincount(order, weights=size)
+        seconds = BLOCK_SEC
+        while True:
+            block = _blocks(self.means.time, self.means.episode, seconds)
+            _, order = np.unique(block, return_inverse=True)
+            total = np.bincount(order, weights=size)
+            # One push may be all that a log has.
+            seconds *= 0.5
+            if total.max() < ONE_BLOCK * total.sum() or seconds < 4.0 * self.half:
+                break
+        self._block = block
         rank = np.empty(len(total), int)
         rank[np.argsort(-total, kind="stable")] = np.arange(len(total))
         self._train = rank[order] % 3 != 1
@@ -104,6 +105,17 @@ class ContactRows(FeltWalls):
     def parts(self) -> np.ndarray:
         number = np.array([t.recording for t in self.tracks])
         return self._of_rows(number[self.means.episode])
+
+
+def _blocks(time: np.ndarray, episode: np.ndarray, seconds: float) -> np.ndarray:
+    """(K,) number of the block, so long, of each test function: its time (K,) and the
+    number of its episode (K,)."""
+    block, first = np.zeros(len(time), int), 0
+    for number in np.unique(episode):
+        mine = episode == number
+        block[mine] = first + ((time[mine] - time[mine].min()) / seconds).astype(int)
+        first = int(block[mine].max()) + 1
+    return block
 
 
 def _gains(effects: Sequence[Effect]) -> set[tuple[tuple[str, ...], float]]:

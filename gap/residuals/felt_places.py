@@ -24,8 +24,7 @@ from makebreak.gap.residuals.fixed_faces import (
     FixedFaces,
 )
 from makebreak.gap.residuals.permitted_contacts import SLACK, Geometry, Shift
-from makebreak.gap.residuals.touching import MEETS
-from makebreak.gap.simulation.contact_shapes import Slot
+from makebreak.gap.simulation.contact_shapes import MEETS, Slot
 from makebreak.models.effects.kind import Effect
 
 STILL_DEEP = 0.1  # Of the nodes at which it was: knocks go deeper, too.

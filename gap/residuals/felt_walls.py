@@ -10,7 +10,8 @@ import numpy as np
 
 from makebreak.gap.numerics.permitted_forces import explain
 from makebreak.gap.residuals.contact_dynamics import ContactDynamics
-from makebreak.gap.residuals.touching import APPROACH, BESIDE, FAR, MEETS, NEAR
+from makebreak.gap.residuals.touching import BESIDE, FAR, NEAR
+from makebreak.gap.simulation.contact_shapes import APPROACH, MEETS
 from makebreak.models.effects.kind import Effect
 
 FEWEST_ROWS = 5  # In which it stays at the wall.

@@ -11,6 +11,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import BodyIndex
 
 from makebreak.gap.data.findings import Finding
 from makebreak.gap.data.pieces import part_of
@@ -186,19 +188,29 @@ def _is_felt(dynamics: SceneDynamics, shapes, recordings) -> bool:
 def walls_of(dynamics: SceneDynamics, own: bool = False) -> ContactShapes | None:
     """Shapes of links, and of what is fixed and, unless `own`, no part of a robot; None
     if there are not both. Raises: DoesNotFit as ContactShapes."""
-    plant = dynamics.plant
-    moving = {
-        plant.GetModelInstanceName(j.model_instance()) for j in one_dof_joints(plant)
-    }
-    shapes = ContactShapes(dynamics.loaded, hulls=False)
-
-    def counts(body: int) -> bool:
-        model = shapes.names[body].split(".")[0]
-        return own or body not in shapes.anchored or model not in moving
-
-    shapes.keep(counts)
+    shapes, bases = ContactShapes(dynamics.loaded, hulls=False), _bases(dynamics.plant)
+    shapes.keep(lambda body: own or body not in shapes.anchored or body not in bases)
     sides = {s.body in shapes.anchored for s in shapes.surfaces}
     return shapes if sides == {True, False} else None
+
+
+def _bases(plant: MultibodyPlant) -> set[int]:
+    """Bodies of the robots' bases: what a joint that moves hangs on, and all that the
+    robot's own model has welded to that, other than by way of the world. (The ground
+    may be in the same file.)"""
+    welded: dict[int, set[int]] = {}
+    for index in plant.GetJointIndices():
+        joint = plant.get_joint(index)
+        both = {int(joint.parent_body().index()), int(joint.child_body().index())}
+        models = {plant.get_body(BodyIndex(k)).model_instance() for k in both}
+        if not joint.num_velocities() and len(models) == 1:
+            for k in both:
+                welded.setdefault(k, set()).update(both)
+    found = set[int]()
+    at = {int(j.parent_body().index()) for j in one_dof_joints(plant)}
+    while at := {other for k in at for other in welded.get(k, {k})} - found - {0}:
+        found |= at
+    return found
 
 
 def positions(dynamics: SceneDynamics, recording: Recording) -> np.ndarray:

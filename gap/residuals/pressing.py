@@ -39,13 +39,13 @@ from makebreak.gap.residuals.impacts import (
 from makebreak.gap.residuals.lying_on_faces import pressed_with_corners
 from makebreak.gap.residuals.mechanism_candidates import loads
 from makebreak.gap.residuals.permitted_contacts import Geometry, Shift
-from makebreak.gap.residuals.touching import MEETS
+from makebreak.gap.residuals.scene_motion import LEAST_HALF
 from makebreak.gap.residuals.wrench_sensor import FORCE
-from makebreak.gap.simulation.contact_shapes import ContactShapes, Slot
+from makebreak.gap.simulation.contact_shapes import MEETS, ContactShapes, Slot
 from makebreak.gap.simulation.face_supports import LiesOn
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.contact import STIFFNESS
-from makebreak.models.effects.kind import Effect, one_dof_joints
+from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
 from makebreak.models.scene import Scene
 
 FELT_SHARE = 0.03  # Of the rows: a wrench that is felt in more of them.
@@ -117,30 +117,41 @@ def presses(dynamics: SceneDynamics, recordings: Sequence[Recording]) -> bool:
 
 
 def push_each_other(dynamics: SceneDynamics, recordings: Sequence[Recording]) -> bool:
-    """Whether what moves on joints touches what moves on others, for a while: a finger
-    an object that slides on a rail. Links that one joint moves do not count: shapes of
-    one robot often overlap."""
+    """Whether what moves on joints touches what moves on others: a finger an object
+    that slides on a rail. An object, which no drive moves, goes only where it is
+    pushed: one touch is enough that means over it fit in. Limbs that have drives pass
+    close by each other: theirs count if they go on for a while. Links that one joint
+    moves do not count: shapes of one robot often overlap."""
     try:
         shapes = ContactShapes(dynamics.loaded, hulls=False)
     except DoesNotFit:
         return False
     plant = dynamics.plant
-    moved_by: dict[int, set[int]] = {k: set() for k in shapes.bodies()}
+    driven, moved_by = set[int](), dict[int, set[int]]()
+    motors = dynamics.loaded.scene.actuation.joints
     for joint in one_dof_joints(plant):
         for body in plant.GetBodiesKinematicallyAffectedBy([joint.index()]):
-            if joint.num_velocities() and int(body) in moved_by:
-                moved_by[int(body)].add(int(joint.index()))
+            if joint.num_velocities():
+                moved_by.setdefault(int(body), set()).add(int(joint.index()))
+                if full_name(plant, joint) in motors:
+                    driven.add(int(body))
 
     def counts(a: int, b: int) -> bool:
-        both = moved_by[a], moved_by[b]
+        both = moved_by.get(a, set()), moved_by.get(b, set())
         return all(both) and not set.intersection(*both)
 
     lasting = whole = 0
     for recording in recordings:
-        q = positions(dynamics, recording)
+        q, time = positions(dynamics, recording), recording.time
         step = max(len(q) // 4000, 1)
-        apart = nearest_of(shapes, dynamics, q[::step], counts)
-        lasting += _rows_of_lasting(apart < MEETS, recording.time[::step])
+        q, time = q[::step], time[::step]
+        pushed = nearest_of(
+            shapes, dynamics, q, lambda a, b: counts(a, b) and not {a, b} <= driven
+        )
+        if _rows_of_lasting(pushed < MEETS, time, 2.0 * LEAST_HALF):
+            return True
+        apart = nearest_of(shapes, dynamics, q, counts)
+        lasting += _rows_of_lasting(apart < MEETS, time)
         whole += len(apart)
     return lasting > FELT_SHARE * whole
 
@@ -162,9 +173,9 @@ def thinned(on: np.ndarray, force: np.ndarray, episode: np.ndarray) -> np.ndarra
     return out
 
 
-def _rows_of_lasting(touching: np.ndarray, time: np.ndarray) -> int:
-    """How many rows (n,) are in touches that last."""
-    return sum(b - a for a, b in runs_of(touching) if time[b - 1] - time[a] > LASTS_SEC)
+def _rows_of_lasting(touching: np.ndarray, time: np.ndarray, sec=LASTS_SEC) -> int:
+    """How many rows (n,) are in touches that last so long [s]."""
+    return sum(b - a for a, b in runs_of(touching) if time[b - 1] - time[a] > sec)
 
 
 class PressingProblem(FeltPlaces):

@@ -7,7 +7,7 @@ import numpy as np
 from makebreak.gap.data.recording import Recording
 from makebreak.gap.residuals.scene_motion import SceneMotion, SmoothedEpisode
 from makebreak.gap.residuals.wrench_sensor import FORCE, WrenchSensor, felt_motion
-from makebreak.gap.simulation.contact_shapes import Slot
+from makebreak.gap.simulation.contact_shapes import APPROACH, MEETS, Slot
 from makebreak.gap.simulation.free_windows import IMPACT_ACCELERATION
 from makebreak.models.scene import Scene
 
@@ -16,8 +16,6 @@ FAR = 1.0  # Of what is not there [m].
 UPRIGHT = 0.7  # Cosine of normal and vertical: less, and it is a wall.
 NEAR = 0.02  # Shapes that never come so near do not matter [m].
 ROBUST = 1.4826  # Standard deviation over median deviation, of normal noise.
-MEETS = 2.5e-3  # Two bodies touch when the nearest points are within this [m].
-APPROACH = 0.02  # Faster along the normal is no lasting contact [m/s].
 # A force is felt where the mean of so many samples is clear of noise, and at least this
 # [N]; where one may be felt, the mean over a test function is so many times its noise.
 FELT_SAMPLES, LEAST_FELT, MAYBE_FELT = 9, 0.2, 4.0
@@ -43,6 +41,8 @@ class Touching(SceneMotion):
         self.biased: dict[str, float] = {}
         # {bodies: where they meet, by what is felt, if not at 0 [m]}.
         self._met_at: dict[tuple[int, int], float] = {}
+        # {bodies: (n_rows,) whether they meet or part just then}, of what moves.
+        self._lands: dict[tuple[int, ...], np.ndarray] = {}
         self._touching = self._touching_rows()
 
     def _pair_of(self, s: Slot) -> tuple[int, int]:
@@ -72,7 +72,10 @@ class Touching(SceneMotion):
         distance = self._least_distances()
         found: dict[tuple[int, ...], np.ndarray] = {}
         for key, phi in distance.items():
-            found[key] = (phi < MEETS) & (np.abs(self._rate(phi)) < APPROACH)
+            near, lasts = phi < MEETS, np.abs(self._rate(phi)) < APPROACH
+            found[key] = near & lasts
+            if not self.shapes.anchored & set(key):  # That may stand elsewhere.
+                self._lands[key] = near & ~lasts
         for sensor in self.sensors:
             welded = set(sensor.welded)
             keys = [key for key in distance if set(key) & welded]
@@ -86,6 +89,7 @@ class Touching(SceneMotion):
                     felt = (size > 0.0) & (distance[key] < NEAR)
                     found[key] = self._without_short_losses(felt)
                     self._apart[key] = distance[key]
+                    self._lands.pop(key, None)
         return found
 
     def _rate(self, phi: np.ndarray) -> np.ndarray:
@@ -252,9 +256,15 @@ class Touching(SceneMotion):
         return maybe
 
     def _is_struck(self, rows: slice) -> np.ndarray:
-        """(n,) whether something free lands at a row: other points carry it then, and
-        the force is over before it is seen."""
-        struck = np.zeros(rows.stop - rows.start, bool)
+        """(n,) whether something lands at a row: of what is free, other points carry it
+        then; and the force is over before it is seen."""
+        struck = np.any(
+            [
+                np.zeros(rows.stop - rows.start, bool),
+                *(lands[rows] for lands in self._lands.values()),
+            ],
+            axis=0,
+        )
         for _, i in self.bodies.values():
             size = np.linalg.norm(self._vd[rows, i + 3 : i + 6], axis=1)
             struck |= size > IMPACT_ACCELERATION

@@ -206,7 +206,8 @@ class Rivals:
             )
             near = search.error(f.score) <= (1.0 + SAME_ERROR) * search.error(fit.score)
             more = identifiable(fit) - identifiable(f)
-            if near and alike and search.is_worse(f, fit, more):
+            worse = search.is_worse(f, fit, more) or search.is_louder(f, fit)
+            if near and alike and worse:
                 continue
             if most is not None:
                 there = search.channel_gains(before, f.left)[most]

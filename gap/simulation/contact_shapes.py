@@ -24,6 +24,8 @@ from makebreak.gap.numerics.edge_crossings import Edge, crossing, edges_of_box
 from makebreak.models.effects.kind import full_name
 from makebreak.models.scene import LoadedScene
 
+MEETS = 2.5e-3  # Two bodies touch when the nearest points are within this [m].
+APPROACH = 0.02  # Faster along the normal is no lasting contact [m/s].
 RIM = 12  # Points on a rim.
 SIDE = 0.9  # Cosine of normal and axis: less, and a cylinder touches with its side.
 MOST_CORNERS = 200  # Of a hull; more are thinned.

@@ -10,7 +10,7 @@ long episode, in which an object is pushed, left and pushed again, they begin so
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -19,11 +19,18 @@ from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.numerics.runs import runs_of
 from makebreak.gap.numerics.signal_noise import jump_variance
 from makebreak.gap.simulation.commands import Commands
-from makebreak.gap.simulation.contact_shapes import ContactShapes, poses_of
+from makebreak.gap.simulation.contact_shapes import (
+    APPROACH,
+    MEETS,
+    ContactShapes,
+    Slot,
+    poses_of,
+)
 from makebreak.gap.simulation.face_supports import LiesOn, add_supports
 from makebreak.gap.simulation.scene_simulation import SceneSimulation
-from makebreak.gap.simulation.windows import TURN, Window, WindowModel
+from makebreak.gap.simulation.windows import BESIDE, TURN, Window, WindowModel
 from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.effects import KINDS
 from makebreak.models.effects.contact import FRICTION
 from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
 from makebreak.models.scene import Scene
@@ -67,7 +74,6 @@ class PushWindows(WindowModel):
         pairs: Sequence[str] = (),
     ):
         self._only, self._pairs = episodes, tuple(pairs)
-        self._shapes: ContactShapes | None = None
         self._draw: np.random.Generator | None = None  # Of efforts, while it is there.
         scene, led = led_as_measured(scene, recordings)
         self._led = led
@@ -197,31 +203,45 @@ class PushWindows(WindowModel):
 
     def _last_apart(self, time, states, first: int, last: int) -> int:
         """The last of some rows at which no robot is near what it pushes; -1: none."""
-        if self._shapes is None:
-            self._shapes = ContactShapes(self.dynamics.loaded)
-        plant, shapes = self.dynamics.plant, self._shapes
-        joints = {
-            full_name(plant, j): j.position_start() for j in one_dof_joints(plant)
-        }
+        free = set(map(int, self.dynamics.plant.GetFloatingBaseBodies()))
         asked = np.arange(time[last], time[first] - 1e-9, -SEEN_APART)
         rows = np.unique(np.searchsorted(time, asked).clip(first, last))
+        near = np.zeros(len(rows), bool)
+        for s in self._slots(states, rows, APART):
+            pair = {s.a, s.b}
+            if pair & free and pair - free - self._shapes.anchored:
+                near |= s.phi < APART
+        return int(rows[~near][-1]) if not near.all() else -1
+
+    def _best_start(self, time, states, row: int) -> int:
+        """The nearest row at which nothing is just about to touch, or to part: the
+        smoothed speed there is a mean of those before and after."""
+        rows = np.flatnonzero(np.abs(time - time[row]) < 0.25 * self.window_sec)
+        lands = np.zeros(len(rows), bool)
+        for s in self._slots(states, rows, MEETS):
+            rate = np.gradient(s.phi, time[rows])
+            lands |= (s.phi < MEETS) & (np.abs(rate) > APPROACH)
+        beside = np.convolve(lands, np.ones(2 * BESIDE + 1), "same") > 0.5
+        calm = rows[~beside & (rows < len(time) - 3)]
+        return int(calm[np.argmin(np.abs(calm - row))]) if len(calm) else row
+
+    @cached_property
+    def _shapes(self) -> ContactShapes:
+        return ContactShapes(self.dynamics.loaded)
+
+    def _slots(self, states, rows: np.ndarray, near: float) -> list[Slot]:
+        """Of shapes that come so near to each other in these rows [m]."""
+        plant = self.dynamics.plant
         q = np.tile(plant.GetPositions(plant.CreateDefaultContext()), (len(rows), 1))
-        for name, index in joints.items():
-            if f"{name}.position" in states:
-                q[:, index] = states[f"{name}.position"][rows, 0]
-        free = set()
+        for j in one_dof_joints(plant):
+            if (name := f"{full_name(plant, j)}.position") in states:
+                q[:, j.position_start()] = states[name][rows, 0]
         for k in plant.GetFloatingBaseBodies():
             body = plant.get_body(k)
-            free.add(int(k))
             for n, axis in enumerate((*TURN, "x", "y", "z")):
                 if (name := f"{full_name(plant, body)}.{axis}") in states:
                     q[:, body.floating_positions_start() + n] = states[name][rows, 0]
-        near = np.zeros(len(rows), bool)
-        for s in shapes.slots(poses_of(plant, q, shapes), APART):
-            pair = {s.a, s.b}
-            if pair & free and pair - free - shapes.anchored:
-                near |= s.phi < APART
-        return int(rows[~near][-1]) if not near.all() else -1
+        return self._shapes.slots(poses_of(plant, q, self._shapes), near)
 
     def _window_at(self, i, recording, episode, time, states, spreads, a, k):
         end = int(np.searchsorted(time, time[k] + self.window_sec, "right"))
@@ -260,7 +280,8 @@ class PushWindows(WindowModel):
         """Of each window what it does, and the variance that uncertain starts make, the
         noise of measured efforts, and frictions that are off by LAW: an arm that pushes
         along a wall may stick or slip by them, and where it does not hold itself a
-        little becomes much."""
+        little becomes much. What dry friction holds creeps by its law, as fast as it
+        fades below, and nowhere else: twice as fast it goes twice as far."""
         rng = np.random.default_rng(0)
         plain = self.simulate(effects)
         wide = [np.zeros_like(y) for y in plain]
@@ -283,6 +304,12 @@ class PushWindows(WindowModel):
                 add(self.simulate(effects), 1.0 / DRAWS)
         finally:
             self.windows, self._draw = kept, None
+        if any(KINDS[e.kind].joint_law for e in (*self.scene.effects, *effects)):
+            self.simulation.fades = 2.0
+            try:
+                add(self.simulate(effects), 1.0)
+            finally:
+                self.simulation.fades = 1.0
         for by in (LAW, -LAW) if self._pairs else ():
             add(self.simulate(self._with_frictions(effects, 1.0 + by)), 0.5)
         return plain, wide

@@ -66,6 +66,7 @@ class SceneSimulation:
         self._scene = scene if isinstance(scene, Scene) else read_scene(scene)
         self._config = config or SimulationConfig()
         self.builds = 0
+        self.fades = 1.0  # Times the speeds below which dry friction fades.
         self.failure = ""  # Why the last run stopped short, if it did.
         self._current: tuple[Effect, ...] = ()
         self._build()
@@ -93,6 +94,9 @@ class SceneSimulation:
             raise
         self._current = tuple(ranked)
         self._commands.set_effects(self._current)
+        forces = self._loaded.joint_forces
+        if forces is not None and self.fades != 1.0:
+            forces.fade_below(self._context, self.fades)
 
     def channels(self) -> list[str]:
         """The measured channels that can be simulated."""

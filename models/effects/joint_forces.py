@@ -11,7 +11,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Joint
 from pydrake.systems.framework import BasicVector, LeafSystem
 
-from makebreak.systems.numerics.joint_laws import N_NUMBERS
+from makebreak.systems.numerics.joint_laws import FADES_AT, LAWS, N_NUMBERS
 
 
 class JointForces(LeafSystem):
@@ -52,6 +52,14 @@ class JointForces(LeafSystem):
         context.get_mutable_numeric_parameter(self._numbers).SetFromVector(
             _padded(numbers)
         )
+
+    def fade_below(self, root_context, times: float) -> None:
+        """Dry friction fades below speeds so many times as high, until new numbers."""
+        context = self.GetMyMutableContextFromRoot(root_context)
+        p = context.get_mutable_numeric_parameter(self._numbers)
+        for k, (law, *_) in enumerate(self._laws):
+            if (at := FADES_AT.get(LAWS.index(law))) is not None:
+                p[N_NUMBERS * k + at] *= times
 
     def _calc(self, context, output):
         x = self._state.Eval(context).tolist()
