@@ -142,11 +142,11 @@ def test_the_mass_of_a_block_on_a_rail_is_named(tmp_path, rng, factor):
 
 @pytest.mark.parametrize(
     ("seconds", "motors", "counts"),
-    [(0.15, "finger.x", True), (0.05, "finger.x", False),
-     (0.15, "finger.x, block.x", False)],
+    [(0.02, "finger.x", True), (0.0, "finger.x", False),
+     (0.02, "finger.x, block.x", False)],
 )  # fmt: skip
 def test_one_short_push_of_an_object_counts(tmp_path, seconds, motors, counts):
-    """If means fit in. What has a motor of its own is no object: limbs pass by."""
+    """What has a motor of its own is no object: limbs pass close by each other."""
     scene = write_scene(tmp_path, MASS)
     scene.write_text(SCENE.replace("[finger.x]", f"[{motors}]"))
     t = np.arange(0.0, 10.0, 0.002)

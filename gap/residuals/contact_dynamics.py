@@ -281,7 +281,8 @@ class ContactDynamics(PermittedContacts):
             off = self.allowance + 1e-9 + 1e-6 * self.acting
             C[:, k, k] += (scale * off) ** 2
             i = np.arange(n_v)
-            C[:, i, i] += held**2 / 3.0  # Evenly in between.
+            # Evenly in between; of one rest all rows err together.
+            C[:, i, i] += held**2 / 3.0 * np.maximum(np.sum(held > 0.0, axis=0), 1)
             kept = [(*(1.0,) * (2 * n_v), None, ())]  # The scene's own, and the last.
             self._root_of = {k: r for k, r in self._root_of.items() if k in kept}
             self._root_of[key] = roots_of(C)

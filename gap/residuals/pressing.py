@@ -39,7 +39,6 @@ from makebreak.gap.residuals.impacts import (
 from makebreak.gap.residuals.lying_on_faces import pressed_with_corners
 from makebreak.gap.residuals.mechanism_candidates import loads
 from makebreak.gap.residuals.permitted_contacts import Geometry, Shift
-from makebreak.gap.residuals.scene_motion import LEAST_HALF
 from makebreak.gap.residuals.wrench_sensor import FORCE
 from makebreak.gap.simulation.contact_shapes import MEETS, ContactShapes, Slot
 from makebreak.gap.simulation.face_supports import LiesOn
@@ -119,9 +118,9 @@ def presses(dynamics: SceneDynamics, recordings: Sequence[Recording]) -> bool:
 def push_each_other(dynamics: SceneDynamics, recordings: Sequence[Recording]) -> bool:
     """Whether what moves on joints touches what moves on others: a finger an object
     that slides on a rail. An object, which no drive moves, goes only where it is
-    pushed: one touch is enough that means over it fit in. Limbs that have drives pass
-    close by each other: theirs count if they go on for a while. Links that one joint
-    moves do not count: shapes of one robot often overlap."""
+    pushed: one touch is enough. Limbs that have drives pass close by each other: theirs
+    count if they go on for a while. Links that one joint moves do not count: shapes of
+    one robot often overlap."""
     try:
         shapes = ContactShapes(dynamics.loaded, hulls=False)
     except DoesNotFit:
@@ -148,7 +147,7 @@ def push_each_other(dynamics: SceneDynamics, recordings: Sequence[Recording]) ->
         pushed = nearest_of(
             shapes, dynamics, q, lambda a, b: counts(a, b) and not {a, b} <= driven
         )
-        if _rows_of_lasting(pushed < MEETS, time, 2.0 * LEAST_HALF):
+        if (pushed < MEETS).any():
             return True
         apart = nearest_of(shapes, dynamics, q, counts)
         lasting += _rows_of_lasting(apart < MEETS, time)
@@ -173,9 +172,9 @@ def thinned(on: np.ndarray, force: np.ndarray, episode: np.ndarray) -> np.ndarra
     return out
 
 
-def _rows_of_lasting(touching: np.ndarray, time: np.ndarray, sec=LASTS_SEC) -> int:
-    """How many rows (n,) are in touches that last so long [s]."""
-    return sum(b - a for a, b in runs_of(touching) if time[b - 1] - time[a] > sec)
+def _rows_of_lasting(touching: np.ndarray, time: np.ndarray) -> int:
+    """How many rows (n,) are in touches that last."""
+    return sum(b - a for a, b in runs_of(touching) if time[b - 1] - time[a] > LASTS_SEC)
 
 
 class PressingProblem(FeltPlaces):
