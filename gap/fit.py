@@ -1,6 +1,7 @@
 """Effects fitted together, exactly and not by their columns."""
 
 from collections.abc import Callable, Sequence
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy.optimize import differential_evolution, least_squares, minimize
@@ -129,8 +130,25 @@ def _solved(cost: Callable, slopes: "_Slopes", z, bounds, steps: int):
         z = solved.x
 
 
+# Of each problem how residuals change with a parameter, by earlier fits: the scene's
+# residual, of whose weights they are, and {(kind, places, name): (m,) column}.
+_known: WeakKeyDictionary[
+    GapProblem, tuple[np.ndarray, dict[tuple[str, tuple[str, ...], str], np.ndarray]]
+] = WeakKeyDictionary()
+
+
+def _known_columns(problem: GapProblem) -> dict:
+    """Those of the weights of now, to be read and added to. Equations are linear in
+    most parameters, so that one fit's slopes are the next one's."""
+    base = problem.base()
+    if problem not in _known or _known[problem][0] is not base:
+        _known[problem] = base, {}
+    return _known[problem][1]
+
+
 class _Slopes:
-    """Of the rows that a fit minimises, with respect to its parameters: differences,
+    """Of the rows that a fit minimises, with respect to its parameters. Differences, or
+    those of an earlier fit, if one step of all parameters at once does what they say;
     taken anew where what the last step did is not what they said, else corrected by it.
 
     Source: Broyden, Math. Comp. 19(92), 1965, method 1.
@@ -149,6 +167,11 @@ class _Slopes:
             for i, _ in free.names
         ]
         self._last: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+        self._columns = _known_columns(problem) if problem.by_equations else {}
+        self._keys = [
+            (free.start[i].kind, tuple(free.start[i].at), name)
+            for i, name in free.names
+        ]
         self.are_exact = False
 
     def renew(self) -> None:
@@ -174,35 +197,66 @@ class _Slopes:
         return J
 
     def _differences(self, z: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        problem, free = self._problem, self._free
         r, J = self._residual(z), np.zeros((len(rows), len(z)))
-        for some in self._sets:
-            off, h = self._moved(z, some, r)
-            if off is None:
-                continue
-            for k in some:
-                alone = np.array(z)
-                alone[k] += h[k]
-                there = np.append(
-                    self._rows_of(r + np.where(self._mine[k], off, 0.0)),
-                    problem.prior_rows(free.effects(alone)),
-                )
-                J[:, k] = (there - rows) / h[k]
-        return np.where(np.isfinite(J), J, 0.0)
-
-    def _moved(self, z: np.ndarray, some: Sequence[int], r: np.ndarray):
-        """(m,) what steps h (k,) of some parameters do, backwards where a step is
-        refused (None: both are), and h."""
         h = self._problem.plan.diff_step * np.maximum(np.abs(z), 0.3)
         h = np.where(z + h > self._free.high / self._free.scale, -h, h)
+        old = [key in self._columns for key in self._keys]
+        for some in self._sets:
+            if not all(old[k] for k in some):
+                self._take(z, some, r, h)
+        if any(old) and not self._hold(z, r, h):
+            for some in self._sets:
+                self._take(z, some, r, h)
+        for k, key in enumerate(self._keys):
+            if key not in self._columns:  # Steps to both sides are refused.
+                continue
+            alone = np.array(z)
+            alone[k] += h[k]
+            there = np.append(
+                self._rows_of(r + self._column(k) * h[k]),
+                self._problem.prior_rows(self._free.effects(alone)),
+            )
+            J[:, k] = (there - rows) / h[k]
+        return np.where(np.isfinite(J), J, 0.0)
+
+    def _column(self, k: int) -> np.ndarray:
+        """(m,) of the residual, as one parameter changes by its typical size."""
+        return self._columns[self._keys[k]] * self._free.scale[k]
+
+    def _take(self, z, some: Sequence[int], r: np.ndarray, h: np.ndarray) -> None:
+        """Columns of some parameters by differences over steps h (k,), backwards where
+        a step is refused."""
         for side in (1.0, -1.0):
             moved = np.array(z)
             moved[some] += side * h[some]
             try:
-                return self._residual(moved) - r, side * h
+                off = self._residual(moved) - r
             except (ValueError, RuntimeError):
                 continue
-        return None, h
+            for k in some:
+                mine = np.where(self._mine[k], off, 0.0)
+                self._columns[self._keys[k]] = mine / (
+                    side * h[k] * self._free.scale[k]
+                )
+            return
+        for k in some:
+            self._columns.pop(self._keys[k], None)
+
+    def _hold(self, z: np.ndarray, r: np.ndarray, h: np.ndarray) -> bool:
+        """Whether columns are what one step of all parameters does, of which each moves
+        the residual about as far."""
+        there = [k for k, key in enumerate(self._keys) if key in self._columns]
+        each = np.array([self._column(k) * h[k] for k in there])
+        sizes = np.linalg.norm(each, axis=1)
+        share = np.clip(np.median(sizes) / np.maximum(sizes, 1e-300), 0.1, 10.0)
+        moved = np.array(z)
+        moved[there] += share * h[there]
+        try:
+            off = self._residual(moved) - r
+        except (ValueError, RuntimeError):
+            return False
+        missed = np.linalg.norm(off - share @ each)
+        return bool(missed <= STRAIGHT * np.linalg.norm(off))
 
 
 def _unidentified(parameter: Parameter, start: float) -> float:

@@ -24,10 +24,8 @@ from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.models.drives import law_of
 from makebreak.models.effects import KINDS
-from makebreak.models.effects.body_forces import MAX_NUMBERS as BODY_NUMBERS
 from makebreak.models.effects.kind import (
     Effect,
-    find_bodies,
     find_body,
     full_name,
     model_names,
@@ -38,6 +36,8 @@ from makebreak.models.joint_tree import NoJointTree, carrier, joint_tree
 from makebreak.models.scene import (
     LoadedScene,
     Scene,
+    body_laws,
+    forces_on_bodies,
     joint_laws,
     load_scene,
     read_scene,
@@ -74,6 +74,7 @@ class SceneDynamics:
         try:  # Compiled: some ten times as fast.
             self._tree: JointTree | None = joint_tree(self.plant)
             self._tree_laws = joint_laws(self.loaded.effects, self.plant)
+            self._tree_pulls = body_laws(self.loaded.effects, self.plant)
         except NoJointTree:
             self._tree = None
         self._carriers: dict = {}
@@ -84,9 +85,9 @@ class SceneDynamics:
     def inverse_dynamics(self, q, v, vd, time=None) -> np.ndarray:
         """Effort (n, n_v) for the motion q (n, n_q), v, vd (n, n_v) at the times (n,)
         [s], which are only needed for time-dependent forces."""
-        if self._tree is not None and not self._body_laws:
+        if self._tree is not None:
             return tree_dynamics.inverse_dynamics(
-                self._tree, q, v, vd, self._tree_laws, time
+                self._tree, q, v, vd, self._tree_laws, time, self._tree_pulls
             )
         plant, context, forces = self.plant, self._context, self._forces
         n = len(v)
@@ -394,18 +395,10 @@ def _laws(loaded: LoadedScene):
     if loaded.joint_forces is not None:
         context = loaded.joint_forces.CreateDefaultContext()
         joint_numbers = np.array(context.get_numeric_parameter(0).value())
-    body_laws = []
-    for effect in loaded.effects:
-        kind = KINDS[effect.kind]
-        if kind.body_law is None or kind.body_numbers is None:
-            continue
-        p = np.zeros(BODY_NUMBERS)
-        numbers = kind.body_numbers(effect)
-        p[: len(numbers)] = numbers
-        body_laws += [
-            (kind.body_law, body, p) for body in find_bodies(effect, loaded.plant)
-        ]
-    return joint_numbers, body_laws
+    return joint_numbers, [
+        (law, body, np.array(p, float))
+        for law, body, p in forces_on_bodies(loaded.effects, loaded.plant)
+    ]
 
 
 def _coordinates(plant: MultibodyPlant) -> dict[str, tuple[str, int, int]]:

@@ -64,6 +64,7 @@ from makebreak.models.effects.transmission import (
     motor_joint,
 )
 from makebreak.models.friction_zones import add_friction_zones
+from makebreak.models.joint_tree import carrier
 from makebreak.models.model_files import (
     DRAKE_ERRORS,
     add_models,
@@ -80,6 +81,9 @@ from makebreak.models.scene_schema import (
     check_scene,
 )
 from makebreak.models.typed_yaml import nearest, one_line
+from makebreak.systems.numerics.body_laws import LAWS as BODY_LAWS
+from makebreak.systems.numerics.body_laws import N_NUMBERS as N_BODY_NUMBERS
+from makebreak.systems.numerics.body_laws import NO_BODY_LAWS, BodyLaws
 from makebreak.systems.numerics.joint_laws import LAWS, N_NUMBERS, JointLaws
 
 __all__ = [
@@ -252,7 +256,8 @@ class LoadedScene:
             self.joint_forces.set_numbers(own, _joint_numbers(plant, new))
         if self.body_forces is not None:
             own = self.body_forces.GetMyMutableContextFromRoot(root_context)
-            self.body_forces.set_numbers(own, _body_numbers(plant, new))
+            numbers_of = [p for _, _, p in forces_on_bodies(new, plant)]
+            self.body_forces.set_numbers(own, numbers_of)
         hidden = [effect for effect in new if KINDS[effect.kind].hidden_state]
         for system, effect in zip(self.couplings, hidden, strict=True):
             own = system.GetMyMutableContextFromRoot(root_context)
@@ -420,13 +425,35 @@ def joint_laws(effects: Sequence[Effect], plant: MultibodyPlant) -> JointLaws:
     return JointLaws(np.array(joint, np.int64), np.array(kind, np.int64), p)
 
 
-def _body_numbers(plant: MultibodyPlant, effects: Sequence[Effect]) -> list:
+def body_laws(effects: Sequence[Effect], plant: MultibodyPlant) -> BodyLaws:
+    """The forces of effects on bodies that are laws of the body's own velocity.
+
+    Args: plant: finalized, whose bodies are links of a tree of joints.
+    """
+    rows = [
+        (*carrier(plant, body)[:2], BODY_LAWS.index(law), _padded(p, N_BODY_NUMBERS))
+        for law, body, p in forces_on_bodies(effects, plant)
+    ]
+    if not rows:
+        return NO_BODY_LAWS
+    link, p_L, kind, p = zip(*rows, strict=True)
+    return BodyLaws(
+        np.array(link, np.int64), np.array(p_L), np.array(kind, np.int64), np.array(p)
+    )
+
+
+def _padded(numbers: Sequence[float], n: int) -> np.ndarray:
+    return np.append(numbers, np.zeros(n - len(numbers)))
+
+
+def forces_on_bodies(effects: Sequence[Effect], plant: MultibodyPlant) -> list[tuple]:
+    """(law, body, its numbers) of each body that effects pull at."""
     return [
-        kind.body_numbers(effect)
+        (kind.body_law, body, kind.body_numbers(effect))
         for effect in effects
         for kind in [KINDS[effect.kind]]
         if kind.body_law is not None and kind.body_numbers is not None
-        for _ in find_bodies(effect, plant)
+        for body in find_bodies(effect, plant)
     ]
 
 
@@ -447,16 +474,10 @@ def _add_joint_forces(effects, plant: MultibodyPlant, builder: DiagramBuilder):
 
 
 def _add_body_forces(effects, plant: MultibodyPlant, builder: DiagramBuilder):
-    on = [
-        (KINDS[effect.kind].body_law, body)
-        for effect in effects
-        if KINDS[effect.kind].body_law is not None
-        for body in find_bodies(effect, plant)
-    ]
+    on = forces_on_bodies(effects, plant)
     if not on:
         return None
-    laws, bodies = zip(*on, strict=True)
-    system = BodyForces(laws, bodies, _body_numbers(plant, effects))
+    system = BodyForces(*zip(*on, strict=True))
     builder.AddNamedSystem("body_forces", system)
     builder.Connect(
         plant.get_body_spatial_velocities_output_port(),

@@ -18,6 +18,8 @@ from makebreak.gap.simulation.scene_simulation import SceneSimulation, Simulatio
 from makebreak.models.effects import KINDS
 from makebreak.models.scene import ActuationSection
 from makebreak.models.scene_schema import SupplySection
+from makebreak.systems.numerics import body_laws
+from makebreak.systems.numerics.body_laws import NO_BODY_LAWS
 from makebreak.systems.numerics.joint_laws import LAWS, law_number
 from makebreak.systems.numerics.joint_tree import mass_and_bias
 
@@ -81,6 +83,13 @@ LACKS = {
         ("joint_offset", "p.swing", dict(offset=0.05)),
     ],
     "lag": [("actuator_lag", "p", dict(time_constant=0.02))],
+    "forces": [
+        ("constant_force", "p.tool", dict(fx=2.0, fy=-1.0, fz=3.0)),
+        ("sinusoidal_force", "p.cart",
+         dict(fx=5.0, fy=0.0, fz=1.0, frequency=1.5, phase=0.4)),
+        ("body_drag", "p.hand", dict(linear=1.5, angular=0.2)),
+        ("body_quadratic_drag", "p.flag", dict(coefficient=0.8)),
+    ],
     "links": [
         ("payload", "p.tool", dict(mass=0.3, com_x=0.05, com_y=0.0, com_z=-0.1)),
         ("link_mass", "p.arm", dict(mass=-0.3)),
@@ -158,7 +167,7 @@ def test_mass_matrix_and_bias_are_those_of_drake(tmp_path):
         plant.SetPositions(context, q)
         plant.SetVelocities(context, v)
         M, bias = np.empty((4, 4)), np.empty(4)
-        mass_and_bias(arm.tree, q, v, M, bias)
+        mass_and_bias(arm.tree, NO_BODY_LAWS, 0.0, q, v, M, bias)
         gravity = plant.CalcGravityGeneralizedForces(context)
         np.testing.assert_allclose(M, plant.CalcMassMatrix(context), atol=1e-12)
         np.testing.assert_allclose(
@@ -174,12 +183,24 @@ def test_every_law_of_a_joint_is_in_the_compiled_list():
         assert entry.joint_law is None or entry.joint_law in LAWS, kind
 
 
+def test_every_law_of_a_body_is_in_the_compiled_list():
+    V, t, p = np.linspace(-0.4, 0.7, 6), 0.1, np.linspace(0.5, 1.2, 8)
+    for number, law in enumerate(body_laws.LAWS):
+        have, want = np.ones((2, 6))
+        body_laws.law_number(number, V, t, p, have)
+        law(V, t, p, want)
+        np.testing.assert_array_equal(have, want)
+        assert (want != 1.0).any()
+    for kind, entry in KINDS.items():
+        assert entry.body_law is None or entry.body_law in body_laws.LAWS, kind
+
+
 def test_what_takes_drakes_own_steps_is_refused(tmp_path):
     scene, joints = tree(tmp_path)
     spring = ("joint_elasticity", joints[1], dict(stiffness=100.0, damping=0.1))
     with pytest.raises(ValueError, match="joint_elasticity takes Drake's own steps"):
         DrivenArmSimulation(with_effects(scene, spring))
-    assert not can_have("body_drag") and can_have("joint_load_friction")
+    assert not can_have("joint_elasticity") and can_have("body_drag")
 
 
 def test_what_cannot_be_stepped_ends_in_nan(tmp_path):

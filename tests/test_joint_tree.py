@@ -15,7 +15,8 @@ from makebreak.systems.numerics.joint_laws import JointLaws, most_friction
 def two_ways(tmp_path):
     """The dynamics of a branching scene, compiled and by Drake, and a motion."""
     scene, _ = tree(tmp_path)
-    scene = with_effects(scene, *ROTORS, *LACKS["friction"], *LACKS["links"])
+    lacks = *LACKS["friction"], *LACKS["links"], *LACKS["forces"]
+    scene = with_effects(scene, *ROTORS, *lacks)
     compiled, drake = SceneDynamics(scene), SceneDynamics(scene)
     assert compiled._tree is not None
     drake._tree = None

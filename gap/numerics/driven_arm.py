@@ -1,6 +1,7 @@
 """Motion of a tree of joints under its drives, with friction that locks, compiled.
 
-    M(q) v' + bias(q, v) = let through(effort(q, v, command)) - damping v + laws(q, v)
+    M(q) v' + bias(q, v, t) = let through(effort(q, v, command)) - damping v
+                              + laws(q, v, t)
 
 Joints turn or slide, each on a link before it or on the world. A drive is that of
 models/effects/actuation_path.py: a loop of position and velocity with a ceiling and a
@@ -19,6 +20,7 @@ import numba
 import numpy as np
 
 from makebreak.systems.arm.numerics.cholesky import cholesky, cholesky_solve
+from makebreak.systems.numerics.body_laws import BodyLaws
 from makebreak.systems.numerics.joint_laws import JointLaws, law_number
 from makebreak.systems.numerics.joint_tree import JointTree, mass_and_bias
 
@@ -38,7 +40,8 @@ class DrivenArm(NamedTuple):
     path: np.ndarray  # (n, 5) gain, bias, limit, time constant, share lost to friction.
     slow: np.ndarray  # (n,) speed below which a gear's friction fades.
     most: np.ndarray  # (n,) what the joint takes at most.
-    laws: JointLaws  # Further forces.
+    laws: JointLaws  # Further forces on joints,
+    pulls: BodyLaws  # and on links.
 
 
 def rollout(arm: DrivenArm, q, v, times, commands, tol: float = 1e-3) -> np.ndarray:
@@ -123,7 +126,7 @@ def _rate(arm, t, x, told, M, L, bias, tau, out):
     y: what the motors that lag give."""
     n = bias.shape[0]
     q, v, y = x[:n], x[n : 2 * n], x[2 * n :]
-    mass_and_bias(arm.tree, q, v, M, bias)
+    mass_and_bias(arm.tree, arm.pulls, t, q, v, M, bias)
     _forces(arm, t, q, v, y, told, tau)
     for i in range(n):
         out[i] = v[i]

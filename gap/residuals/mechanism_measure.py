@@ -20,11 +20,14 @@ from makebreak.gap.simulation.measure import (
     why_stopped,
 )
 from makebreak.gap.simulation.windows import Window, WindowModel, seen_in
-from makebreak.models.drives import law_of
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, sliding_joints
 from makebreak.models.effects.transmission import twist_deviations, twists
 from makebreak.models.scene import Scene
+
+# Of a step [rad/s]: what no drive holds shows the error of each. With it a free double
+# pendulum at 20 rad/s is off by 4e-6 rad after 0.3 s.
+TOL = 1e-6
 
 
 def measure(
@@ -90,14 +93,12 @@ def measure(
 
 
 def _compiled(scene: Scene, effects: Sequence[Effect]) -> DrivenArmSimulation | None:
-    """Compiled code that steps joints whose drives close a loop; None: it takes Drake's
-    steps."""
-    if law_of(scene.actuation, next(iter(scene.actuation.joints), "")) is None:
-        return None  # What a drive does not hold shows the error of every step.
+    """Compiled code that steps joints; None: it takes Drake's steps."""
     try:
         simulation = DrivenArmSimulation(scene)
     except DoesNotFit:
         return None
+    simulation.tol = TOL
     return simulation if all(can_have(e.kind) for e in effects) else None
 
 

@@ -45,8 +45,9 @@ from makebreak.models.effects.kind import (
 )
 from makebreak.models.effects.measured_channels import ChannelMap, channel_maps
 from makebreak.models.joint_tree import NoJointTree, joint_tree, rotors_and_damping
-from makebreak.models.scene import Scene, joint_laws, load_scene
+from makebreak.models.scene import Scene, body_laws, joint_laws, load_scene
 from makebreak.models.scene_schema import COMMANDS_OF, as_kind
+from makebreak.systems.numerics.body_laws import NO_BODY_LAWS
 from makebreak.systems.numerics.joint_laws import FADES_AT, JointLaws
 from makebreak.systems.numerics.joint_tree import JointTree, mass_and_bias
 
@@ -103,7 +104,7 @@ class DrivenArmScene:
         names = {j.velocity_start(): full_name(plant, j) for j in one_dof_joints(plant)}
         q = plant.GetPositions(plant.CreateDefaultContext())
         M = np.empty((n, n))
-        mass_and_bias(tree, q, np.zeros(n), M, np.empty(n))
+        mass_and_bias(tree, NO_BODY_LAWS, 0.0, q, np.zeros(n), M, np.empty(n))
         mobility = np.diag(np.linalg.inv(M))
         if self.scene.actuation.type in STIFF_TYPES:
             for i in np.flatnonzero(arm.driven == LOOP):
@@ -191,7 +192,7 @@ class DrivenArmScene:
                         self._step[i] = own.resolution
         return dict(
             driven=driven, law=law, path=path, slow=slow, most=most,
-            laws=joint_laws(effects, plant),
+            laws=joint_laws(effects, plant), pulls=body_laws(effects, plant),
         )  # fmt: skip
 
 
@@ -252,12 +253,12 @@ class DrivenArmSimulation(SceneSimulation):
 def can_have(kind: str) -> bool:
     """Whether a DrivenArm can have effects of a kind."""
     entry = KINDS[kind]
-    return not (entry.hidden_state or entry.body_law or entry.after_finalize)
+    return not (entry.hidden_state or entry.after_finalize)
 
 
 def _in_plant(kind: str) -> bool:
     entry = KINDS[kind]
-    elsewhere = entry.joint_law or entry.path or entry.channel
+    elsewhere = entry.joint_law or entry.body_law or entry.path or entry.channel
     return not (elsewhere or _of_joint(kind) or _of_link(kind))
 
 

@@ -9,7 +9,7 @@ from pydrake.multibody.plant import ExternallyAppliedSpatialForce
 from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import BasicVector, LeafSystem
 
-MAX_NUMBERS = 8
+from makebreak.systems.numerics.body_laws import N_NUMBERS
 
 
 class BodyForces(LeafSystem):
@@ -42,7 +42,7 @@ class BodyForces(LeafSystem):
             self._calc,
         )
         for law in set(laws):
-            law(np.zeros(6), 0.0, np.ones(MAX_NUMBERS), np.zeros(6))  # Compiles it.
+            law(np.zeros(6), 0.0, np.ones(N_NUMBERS), np.zeros(6))  # Compiles it.
 
     def set_numbers(self, context, numbers: Sequence[Sequence[float]]) -> None:
         """Sets the numbers p of all laws in a Context of this system."""
@@ -57,7 +57,7 @@ class BodyForces(LeafSystem):
         for i, (law, index) in enumerate(self._laws):
             F = np.zeros(6)
             V_WB = np.array(velocities[index].get_coeffs())
-            law(V_WB, time, p[MAX_NUMBERS * i :], F)
+            law(V_WB, time, p[N_NUMBERS * i :], F)
             applied = ExternallyAppliedSpatialForce()
             applied.body_index = index
             applied.p_BoBq_B = np.zeros(3)
@@ -67,7 +67,7 @@ class BodyForces(LeafSystem):
 
 
 def _padded(numbers) -> np.ndarray:
-    flat = np.zeros((len(numbers), MAX_NUMBERS))
+    flat = np.zeros((len(numbers), N_NUMBERS))
     for i, each in enumerate(numbers):
         flat[i, : len(each)] = each
     return flat.ravel()

@@ -2,7 +2,6 @@
 
 import math
 
-import numba
 import numpy as np
 
 from makebreak.models.effects.kind import (
@@ -12,37 +11,15 @@ from makebreak.models.effects.kind import (
     find_bodies,
 )
 from makebreak.models.effects.signature import Signature, without_momentum
+from makebreak.systems.numerics.body_laws import (
+    constant_law,
+    drag_law,
+    quadratic_drag_law,
+    sinusoidal_law,
+)
 
 AXES = ("fx", "fy", "fz")
 FREQUENCIES = tuple(np.round(np.geomspace(0.1, 20.0, 60), 4))  # [Hz]
-
-
-@numba.njit(cache=True)
-def constant_law(V, t, p, F):
-    for i in range(3):
-        F[3 + i] += p[i]
-
-
-@numba.njit(cache=True)
-def sinusoidal_law(V, t, p, F):
-    s = math.sin(2.0 * math.pi * p[3] * t + p[4])
-    for i in range(3):
-        F[3 + i] += p[i] * s
-
-
-@numba.njit(cache=True)
-def drag_law(V, t, p, F):
-    for i in range(3):
-        F[i] -= p[1] * V[i]
-        F[3 + i] -= p[0] * V[3 + i]
-
-
-@numba.njit(cache=True)
-def quadratic_drag_law(V, t, p, F):
-    """-c |v| v on the origin, [N]; p: c [N s2/m2]."""
-    speed = math.sqrt(V[3] ** 2 + V[4] ** 2 + V[5] ** 2)
-    for i in range(3):
-        F[3 + i] -= p[0] * speed * V[3 + i]
 
 
 def _numbers(*names):

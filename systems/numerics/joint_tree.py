@@ -12,6 +12,8 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from makebreak.systems.numerics.body_laws import NO_BODY_LAWS, BodyLaws
+from makebreak.systems.numerics.body_laws import law_number as body_law_number
 from makebreak.systems.numerics.joint_laws import JointLaws, law_number
 
 
@@ -58,15 +60,16 @@ def scratch(n):
 
 
 def inverse_dynamics(
-    tree: JointTree, q, v, vd, laws: JointLaws | None = None, time=None
-) -> np.ndarray:
+    tree: JointTree, q, v, vd, laws: JointLaws | None = None, time=None,
+    pulls: BodyLaws = NO_BODY_LAWS,
+) -> np.ndarray:  # fmt: skip
     """(m, n) efforts on the joints for motions q, v, vd (m, n), against gravity,
-    damping, and further forces of laws at the times (m,) [s]."""
+    damping, and further forces on joints and bodies at the times (m,) [s]."""
     q, v, vd = (np.ascontiguousarray(x, float) for x in (q, v, vd))
     out = np.empty(q.shape)
-    _inverse_dynamics(tree, q, v, vd, out)
+    time = np.zeros(len(q)) if time is None else np.asarray(time, float)
+    _inverse_dynamics(tree, pulls, q, v, vd, time, out)
     if laws is not None and len(laws.joint):
-        time = np.zeros(len(q)) if time is None else np.asarray(time, float)
         _less_laws(laws, q, v, time, out)
     return out
 
@@ -214,13 +217,36 @@ def newton_euler(tree, v, vd, at):
 
 
 @numba.njit(cache=True)
-def mass_and_bias(tree, q, v, M, bias):
+def less_pulls(pulls, t, at):
+    """Takes what pulls at links, moving as `newton_euler` has it, off their forces."""
+    V, p, F = np.empty(6), np.empty(3), np.empty(6)
+    for j in range(pulls.link.shape[0]):
+        i = pulls.link[j]
+        if i < 0:
+            continue
+        for r in range(3):
+            p[r] = at.p[i, r]
+            for s in range(3):
+                p[r] += at.R[i, r, s] * pulls.p_L[j, s]
+        _shifted(V, at.V[i], p)
+        F[:] = 0.0
+        body_law_number(pulls.kind[j], V, t, pulls.p[j], F)
+        at.F[i, 0] -= F[0] + p[1] * F[5] - p[2] * F[4]
+        at.F[i, 1] -= F[1] + p[2] * F[3] - p[0] * F[5]
+        at.F[i, 2] -= F[2] + p[0] * F[4] - p[1] * F[3]
+        for r in range(3, 6):
+            at.F[i, r] -= F[r]
+
+
+@numba.njit(cache=True)
+def mass_and_bias(tree, pulls, t, q, v, M, bias):
     """Fills the mass matrix M (n, n) with rotors, and the forces bias (n,) that hold
-    the velocities v as they are, gravity with them."""
+    the velocities v as they are, against gravity and what pulls at links at time t."""
     n = q.shape[0]
     at, none = scratch(n), np.zeros(n)
     place(tree, q, at)
     newton_euler(tree, v, none, at)
+    less_pulls(pulls, t, at)
     S, m, h, I_o, F = at.S, at.m, at.h, at.I_o, at.F
     momentum = np.empty(6)
     for i in range(n - 1, -1, -1):
@@ -266,13 +292,14 @@ def _times(out, m, h, I_o, twist):
 
 
 @numba.njit(cache=True)
-def _inverse_dynamics(tree, q, v, vd, out):
+def _inverse_dynamics(tree, pulls, q, v, vd, time, out):
     n = q.shape[1]
     at = scratch(n)
     S, F = at.S, at.F
     for row in range(q.shape[0]):
         place(tree, q[row], at)
         newton_euler(tree, v[row], vd[row], at)
+        less_pulls(pulls, time[row], at)
         for i in range(n - 1, -1, -1):
             total = tree.rotor[i] * vd[row, i] + tree.damping[i] * v[row, i]
             for r in range(6):
