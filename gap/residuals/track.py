@@ -121,14 +121,14 @@ def track_of(
     smoothed = _smoothed(recording, episode, joints, noise, time, time + 0.5 * step)
     if smoothed is None:
         return None
-    grid, q, v, vd = smoothed
+    grid, q, v, vd, v_std = smoothed
     held = {c.name: recording.held(c.name)[episode.rows] for c in recording.commands()}
     samples = {c.name: c.values[episode.rows] for c in recording.measured()}
     stages = {c.name: c.stages or () for c in recording.measured()}
     late = max(mean_delay(stages[f"{j}.position"]) for j in joints)
     longest = max(HOLE_PERIODS * period, HOLE_SHARE * bump_sec)
     holes = _holes(time, step, longest, held, late)
-    edges = _around_reversals(time, step, grid, v)
+    edges = _around_reversals(time, step, grid, v, v_std)
     row = np.searchsorted(time, edges[:-1] + 1e-12, "right") - 1
     middle, step = 0.5 * (edges[1:] + edges[:-1]), np.diff(edges)
     bumps = make_bumps(middle, step, bump_sec, 0.5 * bump_sec, holes)
@@ -147,12 +147,12 @@ def track_of(
 
 
 def _smoothed(recording, episode, joints, noise, time, middle):
-    """The grid of rows and middles, and q, v, vd (n_grid, n_v) on it; None where a
-    joint has too few samples."""
+    """The grid of rows and middles, and q, v, vd (n_grid, n_v) on it, and standard
+    deviations of v; None where a joint has too few samples."""
     grid = np.concatenate([time, middle])
     order = np.argsort(grid)
     grid = grid[order]
-    q, v, vd = (np.empty((len(grid), len(joints))) for _ in range(3))
+    q, v, vd, std = (np.empty((len(grid), len(joints))) for _ in range(4))
     for i, joint in enumerate(joints):
         y = recording[f"{joint}.position"][episode.rows]
         if np.isfinite(y).sum() < FEWEST_POSITIONS:
@@ -160,9 +160,10 @@ def _smoothed(recording, episode, joints, noise, time, middle):
         seen = np.concatenate([y, np.full(len(time), np.nan)])[order]
         stages = recording.channels[f"{joint}.position"].stages or ()
         go_on()
-        x = smooth_filtered(grid, seen, noise[i], stages).x
-        q[:, i], v[:, i], vd[:, i] = x.T
-    return grid, q, v, vd
+        found = smooth_filtered(grid, seen, noise[i], stages)
+        q[:, i], v[:, i], vd[:, i] = found.x.T
+        std[:, i] = np.sqrt(np.maximum(found.P[:, 1, 1], 0.0))
+    return grid, q, v, vd, std
 
 
 def _holes(time, step, longest, held, late) -> list[tuple[float, float]]:
@@ -178,12 +179,18 @@ def _holes(time, step, longest, held, late) -> list[tuple[float, float]]:
     return holes
 
 
-def _around_reversals(time, step, grid, v) -> np.ndarray:
+def _around_reversals(time, step, grid, v, v_std) -> np.ndarray:
     """Edges of intervals: the rows' own, in parts where a joint reverses, so that
-    the instant at which friction turns round is known well."""
+    the instant at which friction turns round is known well. (Not of a joint that is so
+    slow that noise does not tell in which interval that is.)"""
     edges = np.append(time, time[-1] + step[-1])
-    speed = np.stack([np.interp(edges, grid, each) for each in v.T], axis=1)
-    turns = (np.sign(speed[1:]) != np.sign(speed[:-1])).any(axis=1)
+    speed, std = (
+        np.stack([np.interp(edges, grid, each) for each in x.T], axis=1)
+        for x in (v, v_std)
+    )
+    turns = np.sign(speed[1:]) != np.sign(speed[:-1])
+    turns &= np.abs(np.diff(speed, axis=0)) > std[1:]
+    turns = turns.any(axis=1)
     turns |= np.append(turns[1:], False) | np.append(False, turns[:-1])
     parts = [
         edges[k]
