@@ -19,7 +19,7 @@ HARDLY, UNSEEN = 1e-3, 1e-3
 SHORT = 8  # Evaluations: a fit of no more is not asked to converge.
 # Of what a step changed, what slopes may have missed: to be kept, and to be as good as
 # exact; and of all that is left, what is nothing.
-BENT, STRAIGHT, NOTHING = 0.1, 1e-3, 1e-6
+BENT, STRAIGHT, NOTHING = 0.1, 1e-2, 1e-6
 # Of a parameter's size: first steps of a search without slopes, and how far around one
 # looks where that ended.
 WANDER, AROUND = 0.2, 0.5
@@ -117,15 +117,17 @@ def fit_effects(
 
 
 def _solved(cost: Callable, slopes: "_Slopes", z, bounds, steps: int):
-    """scipy's least squares, of which the last slopes are exact."""
+    """scipy's least squares, of which the last slopes are exact where it is asked to
+    converge."""
+    solved, converges = None, steps > SHORT
     while True:
-        slopes.renew()
+        slopes.renew(exactly=solved is not None)
         solved = least_squares(
             cost, z, slopes, bounds=bounds, x_scale=1.0, xtol=1e-6,
-            ftol=1e-6 if steps > SHORT else 1e-4, max_nfev=max(steps, 1),
+            ftol=1e-6 if converges else 1e-4, max_nfev=max(steps, 1),
         )  # fmt: skip
         steps -= solved.nfev
-        if slopes.are_exact:
+        if slopes.are_exact or not converges:
             return solved
         z = solved.x
 
@@ -154,9 +156,7 @@ class _Slopes:
     Source: Broyden, Math. Comp. 19(92), 1965, method 1.
     """
 
-    def __init__(
-        self, problem: GapProblem, free: "_Free", residual, cost, rows_of: Callable
-    ):
+    def __init__(self, problem: GapProblem, free: "_Free", residual, cost, rows_of):
         self._problem, self._free = problem, free
         self._residual, self._cost, self._rows_of = residual, cost, rows_of
         alone = [[k] for k in range(len(free.names))]
@@ -172,11 +172,11 @@ class _Slopes:
             (free.start[i].kind, tuple(free.start[i].at), name)
             for i, name in free.names
         ]
-        self.are_exact = False
+        self.are_exact = self._must_be_exact = False
 
-    def renew(self) -> None:
-        """The next are differences."""
-        self._last = None
+    def renew(self, exactly: bool) -> None:
+        """The next are asked for anew."""
+        self._last, self._must_be_exact = None, exactly
 
     def __call__(self, z: np.ndarray) -> np.ndarray:
         """(n, k) at parameters z (k,)."""
@@ -193,31 +193,46 @@ class _Slopes:
                 self._last = z.copy(), rows, J
                 return J
         J = self._differences(z, rows)
-        self._last, self.are_exact = (z.copy(), rows, J), True
+        self._last = z.copy(), rows, J
         return J
 
     def _differences(self, z: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        r, J = self._residual(z), np.zeros((len(rows), len(z)))
-        h = self._problem.plan.diff_step * np.maximum(np.abs(z), 0.3)
-        h = np.where(z + h > self._free.high / self._free.scale, -h, h)
-        old = [key in self._columns for key in self._keys]
-        for some in self._sets:
-            if not all(old[k] for k in some):
-                self._take(z, some, r, h)
-        if any(old) and not self._hold(z, r, h):
-            for some in self._sets:
-                self._take(z, some, r, h)
-        for k, key in enumerate(self._keys):
-            if key not in self._columns:  # Steps to both sides are refused.
-                continue
+        r, h = self._residual(z), self._steps(z)
+        columns, J = self.columns(z), np.zeros((len(rows), len(z)))
+        for k in range(len(z)):
             alone = np.array(z)
             alone[k] += h[k]
             there = np.append(
-                self._rows_of(r + self._column(k) * h[k]),
+                self._rows_of(r + columns[:, k] * h[k]),
                 self._problem.prior_rows(self._free.effects(alone)),
             )
             J[:, k] = (there - rows) / h[k]
         return np.where(np.isfinite(J), J, 0.0)
+
+    def _steps(self, z: np.ndarray) -> np.ndarray:
+        h = self._problem.plan.diff_step * np.maximum(np.abs(z), 0.3)
+        return np.where(z + h > self._free.high / self._free.scale, -h, h)
+
+    def columns(self, z: np.ndarray) -> np.ndarray:
+        """(m, k) of the residual, as each parameter changes by its typical size; 0
+        where steps to both sides are refused."""
+        r, h = self._residual(z), self._steps(z)
+        old = [key in self._columns for key in self._keys]
+        for some in self._sets:
+            if not all(old[k] for k in some):
+                self._take(z, some, r, h)
+        missed = self._missed(z, r, h) if any(old) else 0.0
+        if missed > (STRAIGHT if self._must_be_exact else BENT):
+            for some in self._sets:
+                self._take(z, some, r, h)
+            missed = 0.0
+        self.are_exact = missed <= STRAIGHT
+        none = np.zeros(len(r))
+        each = [
+            self._column(k) if key in self._columns else none
+            for k, key in enumerate(self._keys)
+        ]
+        return np.stack(each, axis=1) if each else np.zeros((len(r), 0))
 
     def _column(self, k: int) -> np.ndarray:
         """(m,) of the residual, as one parameter changes by its typical size."""
@@ -242,9 +257,10 @@ class _Slopes:
         for k in some:
             self._columns.pop(self._keys[k], None)
 
-    def _hold(self, z: np.ndarray, r: np.ndarray, h: np.ndarray) -> bool:
-        """Whether columns are what one step of all parameters does, of which each moves
-        the residual about as far."""
+    def _missed(self, z: np.ndarray, r: np.ndarray, h: np.ndarray) -> float:
+        """Share of what one step of all parameters does, each of which moves the
+        residual about as far, that is not what columns say; infinite where it is
+        refused."""
         there = [k for k, key in enumerate(self._keys) if key in self._columns]
         each = np.array([self._column(k) * h[k] for k in there])
         sizes = np.linalg.norm(each, axis=1)
@@ -254,9 +270,9 @@ class _Slopes:
         try:
             off = self._residual(moved) - r
         except (ValueError, RuntimeError):
-            return False
+            return np.inf
         missed = np.linalg.norm(off - share @ each)
-        return bool(missed <= STRAIGHT * np.linalg.norm(off))
+        return float(missed / max(np.linalg.norm(off), 1e-300))
 
 
 def _unidentified(parameter: Parameter, start: float) -> float:
@@ -278,26 +294,18 @@ def _is_same(residual: Callable, z: np.ndarray, there: np.ndarray) -> bool:
 
 def tangents(
     problem: GapProblem, fitted: Fitted, fixed: Sequence[Sequence[str]]
-) -> np.ndarray:
+) -> tuple[np.ndarray, np.ndarray]:
     """(m, k) how residuals change with each free parameter of what is fitted, in units
-    of its typical size."""
+    of its typical size; and the number (k,) of the effect that each is one of."""
     free = _Free(problem, fitted.effects, [tuple(names) for names in fixed])
-    z, columns = free.x0 / free.scale, []
-    sets = problem.apart(fitted.effects, free.names)
-    for some in sets or [[k] for k in range(len(z))]:
+
+    def residual(z) -> np.ndarray:
         go_on()
-        moved = np.array(z)
-        moved[some] += problem.plan.diff_step
-        try:
-            off = problem.residual(free.effects(moved)) - fitted.r
-        except (ValueError, RuntimeError):
-            continue
-        for k in some:
-            mine = problem.moved_by(fitted.effects[free.names[k][0]])
-            columns.append(np.where(mine, off, 0.0) / problem.plan.diff_step)
-    if not columns:
-        return np.zeros((len(fitted.r), 0))
-    return np.stack(columns, axis=1)
+        return problem.residual(free.effects(z))
+
+    slopes = _Slopes(problem, free, residual, None, None)
+    of = np.array([i for i, _ in free.names], int)
+    return slopes.columns(free.x0 / free.scale), of
 
 
 def derivative_free_search(

@@ -124,7 +124,7 @@ def test_progress_is_said_after_the_last_effect_was_added_too():
     problem._base += 3.0 * np.random.default_rng(2).normal(size=600)
     said: list[str] = []
     select(problem, said.append)
-    for words in ("  without joint_coulomb_friction at arm.joint6: ", ", as a tie: "):
+    for words in ("  without joint_coulomb_friction at arm.joint6", ", as a tie: "):
         assert any(words in text for text in said), words
 
 

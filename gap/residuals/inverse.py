@@ -27,7 +27,7 @@ from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 from makebreak.models.effects.measured_channels import acts_on
-from makebreak.models.effects.signature import Motion, added_effort
+from makebreak.models.effects.signature import Motion, added_effort, linear_signature
 from makebreak.models.scene import Scene
 from makebreak.systems.numerics.filters import LowPass, filtered, with_lag
 
@@ -51,6 +51,8 @@ class InverseModel(WhitenedRows):
         self._means: dict = {}
         self._efforts: dict = {}  # The same of efforts by row, the last used last.
         self._heavier: dict[tuple, SceneDynamics] = {}
+        # {kind: parameters that its effects are linear in; None: they are not}.
+        self._unknowns: dict[str, tuple[str, ...] | None] = {}
 
     def base(self) -> np.ndarray:
         """The residual of the scene as it came."""
@@ -193,13 +195,32 @@ class InverseModel(WhitenedRows):
 
         r = self._kept((where, path), rest)
         for effect in ours:
-            r = r - self._kept(
-                (where, effect.key),
-                partial(_added_mean, effect, dynamics, motion, bumps),
-            )
+            r = r - self._added_mean(where, effect, dynamics, motion, bumps)
         if any(name == "effort_measured" for name, _ in self._other_names()):
             motion = replace(motion, effort=driven())
         return r, motion
+
+    def _added_mean(self, where, effect: Effect, dynamics, motion: Motion, bumps):
+        """(n_bumps, n_v) means over bumps of what an effect adds. Where that is a sum
+        of columns times parameters, the columns' means are kept."""
+        unknowns, p = self._unknowns.get(effect.kind), effect.parameters
+        if effect.kind not in self._unknowns:
+            one = linear_signature(effect, KINDS[effect.kind], dynamics, motion)
+            unknowns = self._unknowns[effect.kind] = one.unknowns if one else None
+        if unknowns is None:
+            return self._kept(
+                (where, effect.key),
+                lambda: bumps.mean(_added(effect, dynamics, motion)),
+            )
+
+        def columns() -> np.ndarray:
+            one = linear_signature(effect, KINDS[effect.kind], dynamics, motion)
+            assert one is not None
+            return bumps.mean(one.columns)
+
+        held = tuple(x for name, x in p.items() if name not in unknowns)
+        kept = self._kept((where, effect.kind, tuple(effect.at), held), columns)
+        return kept @ np.array([p[name] for name in unknowns])
 
     def _driven_by(self, k: int, motion: Motion, effects) -> Motion:
         """A motion with the effort that acts under these effects."""
@@ -394,10 +415,6 @@ def _adds_up(heavy: Sequence[Effect]) -> bool:
     places = [at for e in heavy for at in e.at]
     tilted = any(KINDS[e.kind].at == "base" for e in heavy)
     return len(heavy) < 2 or (not tilted and len(set(places)) == len(places))
-
-
-def _added_mean(effect: Effect, dynamics, motion: Motion, bumps) -> np.ndarray:
-    return bumps.mean(_added(effect, dynamics, motion))
 
 
 def _added(effect: Effect, dynamics: SceneDynamics, motion: Motion) -> np.ndarray:

@@ -91,6 +91,7 @@ class MechanismProblem(InverseModel, GapProblem):
         )
         self._found: list[Candidate] | None = None
         self._nuisances: Nuisances | None = None
+        self._other: InverseModel | None = None
         self._weighed: tuple = ()  # Effects in whose model rows have their noise.
         # Stretches in which something else moved it: they have next to no weight.
         self.pushes: list[Push] = []
@@ -714,7 +715,7 @@ class MechanismProblem(InverseModel, GapProblem):
         scene = with_moved_gains(self.scene, nuisances.names, end.b)
         if recordings is not None:
             try:
-                model = InverseModel(self.scene, recordings)
+                model = self._model_of(recordings)
             except DoesNotFit:  # No episode is long enough.
                 return None
         elif self.train().all():
@@ -755,6 +756,12 @@ class MechanismProblem(InverseModel, GapProblem):
         rest = unexplained(self, self.in_noise(end.left))
         gap, series, where = measured
         return Outcome(gap, series, rest, expects, where)
+
+    def _model_of(self, recordings: Sequence[Recording]) -> InverseModel:
+        """That of other recordings, which is asked for again and again."""
+        if self._other is None or self._other.recordings != list(recordings):
+            self._other = InverseModel(self.scene, recordings)
+        return self._other
 
     def _effort_of_nuisances(self, nuisances: Nuisances) -> dict[str, float]:
         """{joint: standard deviation of its effort [N m]} that is not known of the

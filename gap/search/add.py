@@ -135,7 +135,7 @@ def _ranked(
     rms that the best leaves, against which nuisances are weighed."""
     slopes = np.zeros((len(current.r), 0))
     if chosen and not search.plan.jumps:
-        slopes = tangents(search.problem, current, fixed_parameters(chosen))
+        slopes, _ = tangents(search.problem, current, fixed_parameters(chosen))
     wide = search.screen(current.r, slopes=slopes)
     ranked = [r for r in rank(wide, free) if r.valid]
     scale = 1.0

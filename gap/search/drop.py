@@ -5,12 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from makebreak.gap.fit import fit_effects
+from makebreak.gap.fit import fit_effects, tangents
 from makebreak.gap.problem import Candidate, Fitted, is_sane
 from makebreak.gap.search.choice import (
     Choice,
     called,
     deviations_off,
+    fixed_parameters,
     is_clearly_off,
     is_significant,
     places,
@@ -44,27 +45,40 @@ def drop_needless(
         alike = search.problem.weighed_by(current.effects)
         problem = search.problem if alike is None else alike
         left = screen.fit_nuisances(current.r)[1]
+        slopes, of = np.zeros((len(left), 0)), np.zeros(0, int)
+        if not search.plan.jumps:
+            slopes, of = tangents(problem, current, fixed_parameters(chosen))
         needless: list[tuple[float, int, Fitted]] = []
         for k in range(len(chosen)):
             if search.plan.alike and _is_beyond_doubt(search, chosen, current, k):
                 continue
             rest = search.without(current.effects, k)
             fixed = [c.fixed for i, c in enumerate(chosen) if i != k]
+            # Rivals that were separated by one model's weights differ below the noise.
+            two = chosen[k].of_two and alike is not None
+            error = search.error_without_floor if two else search.error
+            gain = PAIR_GAIN if two else search.plan.least_gain
+            most = error(now.score) / (1.0 - gain)
+            words = f"  without {called(chosen[k].effect)}"
             try:
+                if slopes.shape[1]:  # By columns, the others free: that is quick.
+                    r, others = problem.residual(rest), slopes[:, of != k]
+                    wide = search.screen(r, current.fit.train, slopes=others)
+                    score, less = wide.evaluate(r).score, wide.fit_nuisances(r)[1]
+                    search.say(f"{words}, by columns: {score:.3g}")
+                    if _stays(search, chosen[k], less, left, error(score) > most):
+                        continue
                 smaller = fit_effects(
                     problem, screen, rest, fixed, evaluations=_EVALUATIONS
                 )
             except ValueError:  # What is left would be no scene.
                 continue
-            search.say(f"  without {called(chosen[k].effect)}: {smaller.score:.3g}")
-            # Rivals that were separated by one model's weights differ below the noise.
-            two = chosen[k].of_two and alike is not None
-            error = search.error_without_floor if two else search.error
-            gain = PAIR_GAIN if two else search.plan.least_gain
-            gained = error(now.score) < (1.0 - gain) * error(smaller.score)
+            search.say(f"{words}: {smaller.score:.3g}")
             strains = search.is_strained(smaller) and not search.is_strained(current)
-            stays = strains or _stays(search, chosen[k], smaller.left, left, gained)
-            if not stays:
+            gained = error(smaller.score) > most
+            if not strains and not _stays(
+                search, chosen[k], smaller.left, left, gained
+            ):
                 needless.append((smaller.score, k, smaller))
         if not needless:
             break

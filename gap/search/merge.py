@@ -4,8 +4,17 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations
 
+import numpy as np
+
+from makebreak.gap.fit import tangents
 from makebreak.gap.problem import Candidate, Fitted
-from makebreak.gap.search.choice import Choice, Trial, places, refreshed
+from makebreak.gap.search.choice import (
+    Choice,
+    Trial,
+    fixed_parameters,
+    places,
+    refreshed,
+)
 from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.search.rivals import in_place_of
 from makebreak.gap.search.screen import rank
@@ -55,6 +64,9 @@ def _best(
         c for c in search.problem.candidates(search.nuisances, current)
         if (c.kind, c.at) not in taken
     ]  # fmt: skip
+    slopes, of = np.zeros((len(current.r), 0)), np.zeros(0, int)
+    if not search.plan.jumps:
+        slopes, of = tangents(search.problem, current, fixed_parameters(chosen))
     for i, j in pairs:
         others = [c for k, c in enumerate(chosen) if k != j]
         without = replace(
@@ -68,7 +80,7 @@ def _best(
                 and c.size <= chosen[i].size + chosen[j].size
             ],
             search.without(current.effects, i, j),
-            current,
+            current, slopes[:, (of != i) & (of != j)],
         )  # fmt: skip
         if candidate is None:
             continue
@@ -80,14 +92,21 @@ def _best(
 
 def _best_by_columns(
     search: Comparison, free: Sequence[Candidate], rest: Sequence[Effect],
-    current: Fitted,
+    current: Fitted, slopes: np.ndarray,
 ) -> Candidate | None:  # fmt: skip
-    """The candidate that leaves least beside the rest, to first order."""
+    """The candidate that leaves least beside the rest, whose parameters are free, to
+    first order; none where that is more than is left now. slopes (m, k): of the rest.
+    """
     try:
-        screen = search.screen(search.problem.residual(rest), current.fit.train)
+        r = search.problem.residual(rest)
     except (ValueError, RuntimeError):
         return None
-    ranked = [r for r in rank(screen, free) if r.valid]
+    screen = search.screen(r, current.fit.train, slopes=slopes)
+    most = (1.0 + SAME_ERROR) * search.error(current.score)
+    ranked = [
+        x for x in rank(screen, free)
+        if x.valid and (not slopes.shape[1] or search.error(x.fit.score) <= most)
+    ]  # fmt: skip
     return ranked[0].candidate if ranked else None
 
 

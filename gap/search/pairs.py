@@ -132,7 +132,7 @@ def _with_a_second(
     found = search.problem.next_candidates(fit)
     if not found:
         return []
-    slopes = tangents(search.problem, fit, fixed_parameters(there))
+    slopes, _ = tangents(search.problem, fit, fixed_parameters(there))
     wide = search.screen(fit.r, fit.fit.train, slopes=slopes)
     # Each alternative by itself: the one that fits best may be wrong where rows are
     # held out, and the next one right.

@@ -77,7 +77,7 @@ def _near_by_columns(
         slopes = np.zeros((len(r), 0))
         if rest:
             partly = fit_effects(problem, search.screen(r), rest, fixed, evaluations=1)
-            slopes = tangents(problem, partly, fixed)
+            slopes, _ = tangents(problem, partly, fixed)
     except (ValueError, RuntimeError):
         return []
     screen = search.screen(r, current.fit.train, slopes=slopes)

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
@@ -33,7 +34,7 @@ from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
 from makebreak.models.scene import InitialSection, Scene, initial_for
 from makebreak.models.scene_schema import COMMANDS_OF
 from makebreak.systems.numerics.filters import Stage, mean_delay, memory, with_lag
-from makebreak.systems.numerics.smoother import smooth_filtered
+from makebreak.systems.numerics.smoother import Smoothed, smooth_filtered
 
 _POSITIONS = ("x", "y", "z")
 TURN = ("qw", "qx", "qy", "qz")
@@ -119,6 +120,23 @@ class WindowedResidual:
         k = len(self.channels)
         n = sum(map(n_rows, self.windows))
         return np.tile(np.arange(k), n)[self.measured()]
+
+
+# Of a recording, as models of the same windows are made again and again.
+_states: WeakKeyDictionary[Recording, dict[tuple[str, int], Smoothed]]
+_states = WeakKeyDictionary()
+
+
+def _smoothed(recording: Recording, episode: Episode, name: str) -> Smoothed:
+    """The states of a signal of an episode."""
+    known = _states.setdefault(recording, {})
+    if (name, episode.first) not in known:
+        channel = recording.channels[name]
+        known[name, episode.first] = smooth_filtered(
+            recording.time[episode.rows], recording[name][episode.rows], channel.noise,
+            channel.stages or (),
+        )  # fmt: skip
+    return known[name, episode.first]
 
 
 def _most_seen(seen: np.ndarray, every: int) -> int:
@@ -275,7 +293,7 @@ class WindowModel(WindowedResidual):
             if np.isfinite(y).sum() < 8:
                 return
             stages = recording.channels[name].stages or ()
-            s = smooth_filtered(time, y, recording.channels[name].noise, stages)
+            s = _smoothed(recording, episode, name)
             states[name] = s.x
             spreads[name] = s.P
             if name.rsplit(".", 1)[0] in self.bodies and name[-2:] in (

@@ -117,13 +117,24 @@ def added_effort(
     from its signature; None if only a model with the effect gives it."""
     if kind.added is not None:
         return kind.added(effect, model, motion)
-    if kind.signature is None:
+    one = linear_signature(effect, kind, model, motion)
+    if one is None:
+        return None
+    return one.columns @ np.array([effect.parameters[n] for n in one.unknowns])
+
+
+def linear_signature(
+    effect: Effect, kind: EffectKind, model: Dynamics, motion: Motion
+) -> Signature | None:
+    """The signature of which an effect's contribution is a sum, its unknowns times the
+    parameters of these names; None if it is no such sum."""
+    if kind.added is not None or kind.signature is None:
         return None
     grid = {name: [value] for name, value in effect.parameters.items()}
     one, *more = kind.signature(effect, model, motion, grid)
     if more or not one.exact or any(n not in effect.parameters for n in one.unknowns):
         return None
-    return one.columns @ np.array([effect.parameters[n] for n in one.unknowns])
+    return one
 
 
 def at_joints(
