@@ -144,7 +144,9 @@ class DrivenArmScene:
             if len(self._plants) >= _MOST_KEPT:
                 self._plants.pop(next(iter(self._plants)))
             # Joints' own rotors come later: until then no drive is one that fits them.
-            undriven = replace(self.scene.actuation, type="effort")
+            undriven = self.scene.actuation
+            if COMMANDS_OF[undriven.type]:
+                undriven = replace(undriven, type="effort")
             scene = replace(self.scene, actuation=undriven, effects=list(effects))
             loaded = load_scene(scene, DiagramBuilder())
             try:
