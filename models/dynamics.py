@@ -32,7 +32,12 @@ from makebreak.models.effects.kind import (
     one_dof_joints,
 )
 from makebreak.models.effects.signature import Grid, Motion, Signature
-from makebreak.models.joint_tree import NoJointTree, carrier, joint_tree
+from makebreak.models.joint_tree import (
+    NoJointTree,
+    carrier,
+    changed_context,
+    joint_tree,
+)
 from makebreak.models.scene import (
     LoadedScene,
     Scene,
@@ -81,6 +86,21 @@ class SceneDynamics:
         self._coordinates = _coordinates(self.plant)
 
     # ----- The model
+
+    def with_links(self, effects: Sequence[Effect]) -> "SceneDynamics | None":
+        """That of the same motions with links of other inertias (is_of_link), for
+        inverse dynamics alone; None where the scene is no tree of joints.
+
+        Raises: ValueError for effects that the scene cannot have.
+        """
+        if self._tree is None:
+            return None
+        other = object.__new__(SceneDynamics)
+        other.__dict__.update(self.__dict__)
+        ranked = sorted(effects, key=lambda e: KINDS[e.kind].rank)
+        other._context = changed_context(self.plant, ranked)
+        other._tree = joint_tree(self.plant, other._context)
+        return other
 
     def inverse_dynamics(self, q, v, vd, time=None) -> np.ndarray:
         """Effort (n, n_v) for the motion q (n, n_q), v, vd (n, n_v) at the times (n,)

@@ -1,5 +1,7 @@
 """The numbers of a plant whose bodies are links of a tree of joints."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
@@ -9,7 +11,8 @@ from pydrake.multibody.tree import (
     RigidBody,
 )
 
-from makebreak.models.effects.kind import one_dof_joints
+from makebreak.models.effects import KINDS
+from makebreak.models.effects.kind import Effect, one_dof_joints
 from makebreak.systems.numerics.joint_tree import JointTree
 
 
@@ -83,6 +86,26 @@ def joint_tree(plant: MultibodyPlant, context=None) -> JointTree:
         **rotors_and_damping(plant, context),
         gravity=np.array(plant.gravity_field().gravity_vector()),
     )  # fmt: skip
+
+
+def is_of_link(kind: str) -> bool:
+    """Whether it changes the inertia of a link that is there, without another plant."""
+    entry = KINDS[kind]
+    return bool(entry.at == "body" and entry.set_in_context and entry.edit_text)
+
+
+def changed_context(plant: MultibodyPlant, effects: Sequence[Effect]):
+    """A Context of a plant whose links and joints have these effects, too.
+
+    Raises: ValueError for effects that it cannot have.
+    """
+    context = plant.CreateDefaultContext()
+    for effect in effects:
+        change = KINDS[effect.kind].set_in_context
+        assert change is not None
+        none = dict.fromkeys(effect.parameters, 0.0)
+        change(Effect(effect.kind, effect.at, none), effect, plant, context)
+    return context
 
 
 def carrier(

@@ -1,5 +1,7 @@
 """Compiled dynamics of a tree of joints against Drake's plant."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from effect_scenes import on_ground, with_effects
@@ -7,6 +9,7 @@ from pydrake.multibody.tree import BodyIndex
 from test_driven_arm import LACKS, ROTORS, tree
 
 from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.effects.kind import Effect
 from makebreak.models.joint_tree import NoJointTree, joint_tree
 from makebreak.systems.numerics.joint_laws import JointLaws, most_friction
 
@@ -63,3 +66,20 @@ def test_friction_holds_with_the_most_of_its_laws_of_dry_friction():
     )  # fmt: skip
     # A Stribeck friction holds with its static one; a spring holds nothing.
     np.testing.assert_allclose(most_friction(laws, 3), [0.0, 1.1, 0.0])
+
+
+def test_links_of_other_inertias_are_those_of_another_plant(tmp_path):
+    scene, _ = tree(tmp_path)
+    heavy = [
+        Effect("link_mass", ["p.arm"], {"mass": -0.3}),
+        Effect("link_com", ["p.arm"], {"x": 0.02, "y": -0.01, "z": 0.03}),
+        Effect("link_mass", ["p.tool"], {"mass": 0.1}),
+    ]
+    built = SceneDynamics(replace(scene, effects=heavy))
+    changed = SceneDynamics(scene).with_links(heavy)
+    assert changed is not None
+    q, v, vd = np.random.default_rng(1).normal(size=(3, 9, 4))
+    want = built.inverse_dynamics(q, v, vd)
+    np.testing.assert_allclose(changed.inverse_dynamics(q, v, vd), want, atol=1e-11)
+    plain = SceneDynamics(scene).inverse_dynamics(q, v, vd)
+    assert np.abs(plain - want).max() > 0.1

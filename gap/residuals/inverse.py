@@ -28,6 +28,7 @@ from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 from makebreak.models.effects.measured_channels import acts_on
 from makebreak.models.effects.signature import Motion, added_effort, linear_signature
+from makebreak.models.joint_tree import is_of_link
 from makebreak.models.scene import Scene
 from makebreak.systems.numerics.filters import LowPass, filtered, with_lag
 
@@ -120,7 +121,10 @@ class InverseModel(WhitenedRows):
         dynamics: SceneDynamics = self.dynamics
         heavy = [e for e in ours if KINDS[e.kind].weighs]
         if not _adds_up(heavy):
-            dynamics = self._with(heavy)
+            if all(is_of_link(e.kind) for e in heavy):
+                dynamics = self.dynamics.with_links(heavy) or self._with(heavy)
+            else:
+                dynamics = self._with(heavy)
             ours = [e for e in ours if e not in heavy]
         on_top = [e for e in ours if KINDS[e.kind].on_top is not None]
         gains = self.gains_with(effects)  # In units of what is commanded or measured.

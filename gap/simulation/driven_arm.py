@@ -44,7 +44,13 @@ from makebreak.models.effects.kind import (
     velocity_unit,
 )
 from makebreak.models.effects.measured_channels import ChannelMap, channel_maps
-from makebreak.models.joint_tree import NoJointTree, joint_tree, rotors_and_damping
+from makebreak.models.joint_tree import (
+    NoJointTree,
+    changed_context,
+    is_of_link,
+    joint_tree,
+    rotors_and_damping,
+)
 from makebreak.models.scene import Scene, body_laws, joint_laws, load_scene
 from makebreak.models.scene_schema import COMMANDS_OF, as_kind
 from makebreak.systems.numerics.body_laws import NO_BODY_LAWS
@@ -87,10 +93,10 @@ class DrivenArmScene:
             if not can_have(effect.kind):
                 raise DoesNotFit(f"effect {effect.kind} takes Drake's own steps")
         plant, tree = self._plant([e for e in every if _in_plant(e.kind)])
-        links = [e for e in every if _of_link(e.kind)]
+        links = [e for e in every if is_of_link(e.kind)]
         joints = [e for e in every if _of_joint(e.kind)]
         if links or joints:
-            context = _changed(plant, [*links, *joints])
+            context = changed_context(plant, [*links, *joints])
             if links:
                 tree = joint_tree(plant, context)
             else:
@@ -261,7 +267,7 @@ def can_have(kind: str) -> bool:
 def _in_plant(kind: str) -> bool:
     entry = KINDS[kind]
     elsewhere = entry.joint_law or entry.body_law or entry.path or entry.channel
-    return not (elsewhere or _of_joint(kind) or _of_link(kind))
+    return not (elsewhere or _of_joint(kind) or is_of_link(kind))
 
 
 def _of_joint(kind: str) -> bool:
@@ -269,23 +275,3 @@ def _of_joint(kind: str) -> bool:
     entry = KINDS[kind]
     numbers = [p.neutral for p in entry.parameters]
     return bool(entry.at == "joint" and entry.set_in_context and numbers == [0.0])
-
-
-def _of_link(kind: str) -> bool:
-    """Whether it changes the inertia of a link that is there, without another plant."""
-    entry = KINDS[kind]
-    return bool(entry.at == "body" and entry.set_in_context and entry.edit_text)
-
-
-def _changed(plant: MultibodyPlant, effects: Sequence[Effect]):
-    """A Context of a plant whose links and joints have these effects, too.
-
-    Raises: ValueError for effects that it cannot have.
-    """
-    context = plant.CreateDefaultContext()
-    for effect in effects:
-        change = KINDS[effect.kind].set_in_context
-        assert change is not None
-        none = dict.fromkeys(effect.parameters, 0.0)
-        change(Effect(effect.kind, effect.at, none), effect, plant, context)
-    return context
