@@ -387,23 +387,16 @@ def problem_for(
         one that does.
     """
     if _is_mechanism(dynamics, recordings):
-        if meets and push_each_other(dynamics, recordings):
+        for touches, made_of in _WHERE_IT_TOUCHES if meets else ():
+            if not touches(dynamics, recordings):
+                continue
             try:
-                return _contact_problem(scene, recordings)
-            except DoesNotFit:  # Too short, or it is no contact that they show.
+                with present().share(2).running():
+                    return made_of(scene, recordings)
+            except DoesNotFit:  # Too short or little motion, or it shows no contact.
                 pass
-        if meets and presses(dynamics, recordings):
-            try:
-                pressing = PressingProblem(scene, recordings)
-                return pressing, point_on_face(pressing, pressing.lying())
-            except DoesNotFit:  # Too little motion.
-                pass
-        if meets and runs_against(dynamics, recordings):
-            try:
-                impacts = ImpactProblem(scene, recordings)
-                return impacts, set_command_times(impacts)
-            except DoesNotFit:  # Too few touches to tell.
-                pass
+            except Stopped:  # Then the stretches in which nothing touches are left.
+                present().leave("what touches: its stretches are left out")
         return equations_of(scene, recordings, dynamics, jobs)
     if any(joint.num_velocities() for joint in one_dof_joints(dynamics.plant)):
         try:
@@ -450,6 +443,22 @@ def _contact_problem(
 ) -> tuple[ContactProblem, list[Finding]]:
     contact = contact_problem(scene, recordings)
     return contact, sap_lift(contact) + point_on_face(contact, contact.lying())
+
+
+def _pressing_problem(scene: Scene, recordings: Sequence[Recording]):
+    pressing = PressingProblem(scene, recordings)
+    return pressing, point_on_face(pressing, pressing.lying())
+
+
+def _impact_problem(scene: Scene, recordings: Sequence[Recording]):
+    impacts = ImpactProblem(scene, recordings)
+    return impacts, set_command_times(impacts)
+
+
+_WHERE_IT_TOUCHES = (
+    (push_each_other, _contact_problem), (presses, _pressing_problem),
+    (runs_against, _impact_problem),
+)  # fmt: skip
 
 
 def explains_more(one: GapResult, other: GapResult) -> bool:

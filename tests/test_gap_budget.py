@@ -15,12 +15,14 @@ import pytest
 from test_gap_report import small_case
 
 from makebreak.gap import budget as budgets
+from makebreak.gap import workflow
 from makebreak.gap.budget import Budget, Stopped
 from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.report.files import write_report
 from makebreak.gap.residuals.mechanism import MechanismProblem
 from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.workflow import run_gap
+from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import read_scene
 from makebreak.scripts.cli import commands as cli
@@ -158,6 +160,20 @@ def test_each_part_of_a_run_has_its_own_end(monkeypatch):
         assert may("search")
     now[0] = 31.0  # Nobody waits for long who asked for the end.
     assert [may(part) for part in parts] == [False] * 4
+
+
+def test_contact_that_takes_too_long_leaves_time_for_what_is_free(case, monkeypatch):
+    def endless(scene, recordings):
+        while True:
+            budgets.go_on()
+
+    touching = ((lambda *_: True, endless),)
+    monkeypatch.setattr(workflow, "_WHERE_IT_TOUCHES", touching)
+    scene, recordings = read_scene(case[0]), read_recordings([case[1]])
+    with Budget(1.0).running() as budget:
+        problem, _ = workflow.problem_for(scene, recordings, SceneDynamics(scene))
+        assert isinstance(problem, MechanismProblem)
+    assert budget.undone == ["what touches: its stretches are left out"]
 
 
 def test_effects_that_no_scene_can_have_change_no_weights(case):

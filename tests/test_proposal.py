@@ -111,13 +111,16 @@ def test_numbers_count_from_zero_where_any_group_does():
 
 def test_joints_are_found_by_name_and_commands_without_a_quantity():
     columns = {"t": T} | sines(
-        ["shoulder_pan_goal", "shoulderPan_pos", "wrist_roll_vel", "gripper_pos"]
-    )
+        ["shoulder_pan_goal", "shoulderPan_pos", "wrist_roll_vel", "gripper_pos",
+         "elbow_flex Soll", "elbow_flex Ist"]
+    )  # fmt: skip
     found = channels(columns, NAMED)
     assert found["shoulder_pan_goal"] == "so.shoulder_pan.position_command"
     assert found["shoulderPan_pos"] == "so.shoulder_pan.position"
     assert found["wrist_roll_vel"] == "so.wrist_roll.velocity"
     assert found["gripper_pos"] is None
+    assert found["elbow_flex Soll"] == "so.elbow_flex.position_command"
+    assert found["elbow_flex Ist"] == "so.elbow_flex.position"
 
 
 def test_qd_is_a_speed_or_a_command_by_what_it_goes_with():

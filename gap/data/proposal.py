@@ -21,7 +21,7 @@ from makebreak.gap.data.units import in_units, quantity_of_unit, unit_in_name
 UNKNOWN_JOINT = "of an unknown joint"  # Why such a column is left out.
 _COMMAND = set(
     "cmd command commands commanded target desired des ref reference goal goals "
-    "setpoint action sp control".split()
+    "setpoint action sp control soll sollwert".split()
 )
 _WORDS = {
     "acceleration": set("acc acceleration accelerations ddq qdd accel".split()),
@@ -58,7 +58,8 @@ _SINCE_1970 = 1e9  # [s]
 _TIME_UNITS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0}
 # A joint's name with nothing but these is where it is.
 _NOW = set(
-    "present actual measured meas act observation obs observed real value".split()
+    "present actual measured meas act observation obs observed real value ist "
+    "istwert".split()
 )
 
 

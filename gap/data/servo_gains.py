@@ -91,40 +91,39 @@ def gains_of_efforts(
         averaged = averaged_motion(motion)
         if averaged is None or motion.effort is None:
             return [None] * len(parts)
-        even, _, _, (kernel, *_), (mean, rate, rate2) = averaged
+        even, step, _, (kernel, *_), (mean, rate, rate2) = averaged
         for i, own in enumerate(parts):
             # Both as they are in their rows: between these a step of the command
-            # changes them alike. An acceleration is the rate half a row later.
+            # changes them alike. A row's rate may be that of a row before or after.
             told, effort = (
                 np.convolve(np.interp(even, motion.time, y[:, i]), kernel, "valid")
                 for y in (motion.command, motion.effort)
             )
-            X = [told - mean[:, i], -rate[:, i], rate2[:, i], -rate2[:, i]]
-            own.append((np.stack(X, axis=1), effort))
-    found = [_law(*each) for each in zip(parts, known, strict=True)]
-    others = [(own.kp, own.kd) for own in found if own is not None]
-    for i, own in enumerate(parts):  # Of one that tells no gains, those of another.
-        for other in others if found[i] is None else ():
-            found[i] = found[i] or _law(own, other)
-    return found
+            rates = rate[:, i, None] + [-step, step] * rate2[:, i, None]
+            own.append((np.column_stack([told - mean[:, i], -rates]), effort))
+    return [_law(*each) for each in zip(parts, known, strict=True)]
 
 
 def _law(parts: Sequence[tuple[np.ndarray, np.ndarray]], known) -> ServoGains | None:
-    """From error, rate and acceleration, twice, (m, 4) and effort (m,) of each log."""
+    """From error and rates (m, 3), and effort (m,), of each log."""
     if not parts:
         return None
     X, y = (np.concatenate(each) for each in zip(*parts, strict=True))
     if not (np.isfinite(X).all() and np.isfinite(y).all() and np.ptp(y) > 0.0):
         return None
     most = LAW_LEAVES * np.var(y) * len(y)
-    if known is not None and nnls(X[:, 2:], y - X[:, :2] @ known)[1] ** 2 < most:
-        return ServoGains(known[0], known[1], 0.0, 0.0)
+    if known is not None:
+        kp, kd = known
+        other = kd * (X[:, 2] - X[:, 1])  # Of so much of its rate the row after.
+        rest = y - kp * X[:, 0] - kd * X[:, 1]
+        share = np.clip(rest @ other / max(other @ other, 1e-300), 0.0, 1.0)
+        if np.sum((rest - share * other) ** 2) < most:
+            return ServoGains(kp, kd, 0.0, 0.0)
     size = np.maximum(np.sqrt(np.mean(X**2, axis=0)), 1e-12)
     c, left = nnls(X / size, y)
-    kp, kd, *_ = c / size
-    if left**2 > most or nnls(X[:, 2:], y)[1] ** 2 < most:  # A rotor alone would do.
-        return None
-    return ServoGains(float(kp), float(kd), 0.0, 0.0)
+    kp, *rates = c / size
+    good = kp > 0.0 and left**2 < most
+    return ServoGains(float(kp), float(sum(rates)), 0.0, 0.0) if good else None
 
 
 def _joints(plant: MultibodyPlant) -> list:

@@ -18,6 +18,7 @@ from pydrake.geometry import Box, Capsule, Convex, Cylinder, HalfSpace, Mesh, Sp
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex
 
+from makebreak.gap.budget import go_on
 from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.numerics import surface_distance
 from makebreak.gap.numerics.edge_crossings import Edge, crossing, edges_of_box
@@ -371,6 +372,7 @@ class ContactShapes:
         of_surfaces = {s.geometry for s in self.surfaces}
         middles = [p + R @ s.p_BG for s in self.surfaces for R, p in (poses[s.body],)]
         for i, point in enumerate(self.points):
+            go_on()
             R_a, p_a = poses[point.body]
             place = p_a + R_a @ point.p_B
             each: list[tuple[int, np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
