@@ -1522,3 +1522,69 @@ def test_how_late_poses_are_is_read_by_name():
         ),
     )  # fmt: skip
     assert wanted(problem) == {"a": 0.02}
+
+
+class Line(GapProblem):
+    """Rows that are linear in two frictions, or bent; how often they are asked for."""
+
+    by_equations = True
+    plan = SearchPlan()
+    dynamics = SimpleNamespace(now=lambda kind, at: {}, least=lambda kind, at: {})
+
+    def __init__(self, bend: float):
+        rng = np.random.default_rng(0)
+        self.X, self.bend, self.asked = rng.normal(size=(60, 2)), bend, 0
+        self._base = 0.3 * rng.normal(size=60) + self.X @ [2.0, 1.0]
+
+    def residual(self, effects=()):
+        self.asked += 1
+        x = [sum(e.parameters["coulomb"] for e in effects if e.at == [j]) for j in "ab"]
+        return self._base - self.X @ x - self.bend * self.X[:, 0] * x[0] * x[1]
+
+    def base(self):
+        return self._base
+
+    def train(self):
+        return np.ones(60, bool)
+
+    def blocks(self):
+        return np.arange(60) // 6
+
+    def channel_of_rows(self):
+        return np.zeros(60, int)
+
+    def nuisances(self):
+        return Nuisances.none(60)
+
+    def candidates(self, nuisances, current):
+        return []
+
+    def where(self, left):
+        return []
+
+    def outcome(self, *_, **__):
+        return None
+
+    def fitted(self, *at):
+        start = [Effect("joint_coulomb_friction", [j], {"coulomb": 0.5}) for j in at]
+        screen = Screen(self.base(), np.zeros((60, 0)), np.zeros(0), self.train())
+        self.asked = 0
+        return fit.fit_effects(self, screen, start)
+
+
+@pytest.mark.parametrize("bend", [0.0, 3.0])
+def test_slopes_of_one_fit_serve_the_next_where_they_hold(bend):
+    problem, alone = Line(bend), Line(bend)
+    problem.fitted("a")
+    problem.fitted("b")
+    known = problem.fitted("a", "b")
+    asked = problem.asked
+    anew = alone.fitted("a", "b")
+    for one, other in zip(known.effects, anew.effects, strict=True):
+        assert one.parameters == pytest.approx(other.parameters, rel=1e-4)
+    assert known.std[0] == pytest.approx(anew.std[0], rel=0.05)
+    # Both columns are there; where they are others beside each other, that is seen.
+    assert (asked < alone.asked) == (bend == 0.0)
+    problem._base = problem._base.copy()  # In other weights.
+    again = problem.fitted("a", "b")
+    assert problem.asked >= alone.asked and again.effects == pytest.approx(anew.effects)
