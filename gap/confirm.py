@@ -18,7 +18,12 @@ from makebreak.gap.data.recording import Recording
 from makebreak.gap.fit import fit_effects
 from makebreak.gap.problem import Fitted, GapProblem, Outcome, leaves_gap
 from makebreak.gap.result import GapMeasure
-from makebreak.gap.search.choice import Choice, Selection, fixed_parameters
+from makebreak.gap.search.choice import (
+    Choice,
+    Selection,
+    fixed_parameters,
+    units_of,
+)
 from makebreak.gap.search.select import without
 from makebreak.gap.thresholds import (
     AGREEMENT_RMS_MAX,
@@ -128,11 +133,8 @@ def _needless(
 ) -> list[Veto]:
     """The last one of several effects (or of groups, one kind at several places) with
     which held-out windows are worse than with the others alone."""
-    units: dict[object, list[Choice]] = {}
-    for k, choice in enumerate(selection.choices):
-        key = choice.effect.kind if choice.in_group else k
-        units.setdefault(key, []).append(choice)
-    for unit in reversed(units.values()) if len(units) > 1 else ():
+    units = units_of(selection.choices)
+    for unit in reversed(units) if len(units) > 1 else ():
         alone = _gap_without(problem, selection, unit, judge)
         if alone is None:
             continue

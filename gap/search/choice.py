@@ -19,6 +19,16 @@ from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 
 
+def units_of(chosen: Sequence["Choice"]) -> list[list["Choice"]]:
+    """What was added at once: groups, one kind at several places, and single effects,
+    in the order in which they were added."""
+    units: dict[object, list[Choice]] = {}
+    for k, choice in enumerate(chosen):
+        key = choice.effect.kind if choice.in_group else k
+        units.setdefault(key, []).append(choice)
+    return list(units.values())
+
+
 class Trial(NamedTuple):
     """A candidate that was fitted exactly, beside all that was chosen before it."""
 

@@ -9,7 +9,13 @@ from dataclasses import replace
 from makebreak.gap.fit import fit_effects
 from makebreak.gap.problem import GapProblem, Outcome, is_sane
 from makebreak.gap.result import RivalSet
-from makebreak.gap.search.choice import Choice, Selection, called, refreshed
+from makebreak.gap.search.choice import (
+    Choice,
+    Selection,
+    called,
+    refreshed,
+    units_of,
+)
 from makebreak.gap.search.select import without
 from makebreak.gap.thresholds import (
     AGREEMENT_RMS_MAX,
@@ -55,30 +61,31 @@ def above_step(
     jobs: int,
 ) -> tuple[Selection, Outcome | None, list[tuple[Choice, str]], float]:
     """The selection without effects that move simulated windows, which agree without
-    them, less than the scene's own time step does: the world may have such a step, too,
-    or none. And what it comes to; those effects, and why; the held-out error with them.
+    them, less than the scene's own time step does, all together: the world may have
+    such a step, too, or none. And what it comes to; those effects, and why; the
+    held-out error with them.
 
     Args: step: what the scene's time step errs by, in windows' expected errors.
     """
     small: list[tuple[Choice, str]] = []
-    below = problem.error(selection.end)
-    for choice in reversed(selection.choices) if step > 0.0 else ():
-        if outcome is None or not outcome.gap.is_measured:
+    below, first = problem.error(selection.end), outcome
+    for unit in reversed(units_of(selection.choices)) if step > 0.0 else ():
+        if first is None or not first.gap.is_measured:
             break
-        fewer = without(problem, selection, choice.effect)
+        fewer = without(problem, selection, *[choice.effect for choice in unit])
         other = problem.outcome(
             fewer.effects(), fewer.start, fewer.end, fewer.nuisances, jobs=jobs
         )
         if other is None or not other.gap.is_measured:
             break
-        moved = abs(other.gap.after**2 - outcome.gap.after**2) ** 0.5
+        moved = abs(other.gap.after**2 - first.gap.after**2) ** 0.5
         if other.gap.after <= AGREEMENT_RMS_MAX and moved <= step:
             why = (
-                f"It moves simulated windows by {moved:.2g} times the expected "
-                f"error, no more than the scene's time step errs by "
-                f"({step:.2g})."
+                "It moves simulated windows, with what else moves them as little, by "
+                f"{moved:.2g} times the expected error, no more than the scene's time "
+                f"step errs by ({step:.2g})."
             )
-            small.append((choice, why))
+            small += [(choice, why) for choice in unit]
             selection, outcome = fewer, other
     return selection, outcome, small, below if small else float("inf")
 
