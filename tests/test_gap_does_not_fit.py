@@ -84,7 +84,9 @@ def outcomes(monkeypatch, error):
         lying=list,
         pressed=list,
         creep_sec=0.0,
+        _other=None,
     )
+    problem._model_of = partial(mechanism.MechanismProblem._model_of, problem)
     end = SimpleNamespace(b=None)
     names = SimpleNamespace(names=())
     for kind, own, recordings in (
