@@ -387,7 +387,11 @@ def problem_for(
         one that does.
     """
     if _is_mechanism(dynamics, recordings):
-        for touches, made_of in _WHERE_IT_TOUCHES if meets else ():
+        kinds = (
+            (push_each_other, _contact_problem), (presses, _pressing_problem),
+            (runs_against, _impact_problem),
+        )  # fmt: skip
+        for touches, made_of in kinds if meets else ():
             if not touches(dynamics, recordings):
                 continue
             try:
@@ -453,12 +457,6 @@ def _pressing_problem(scene: Scene, recordings: Sequence[Recording]):
 def _impact_problem(scene: Scene, recordings: Sequence[Recording]):
     impacts = ImpactProblem(scene, recordings)
     return impacts, set_command_times(impacts)
-
-
-_WHERE_IT_TOUCHES = (
-    (push_each_other, _contact_problem), (presses, _pressing_problem),
-    (runs_against, _impact_problem),
-)  # fmt: skip
 
 
 def explains_more(one: GapResult, other: GapResult) -> bool:
