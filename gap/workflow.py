@@ -293,8 +293,7 @@ def _compared(
     seconds["simulate"] = clock.lap()
 
     def in_another_way() -> tuple[GapProblem, Selection, GapResult]:
-        """What windows do not name, equations may; and the reverse. (What most of the
-        gap has a name for is not asked again: that takes as long as the first.)"""
+        """What windows do not name, equations may; and the reverse."""
         first = problem, selection, result
         say("preparing another comparison")
         with budget.share(1).running() as own:
@@ -346,7 +345,7 @@ def _compared(
         )
         seconds["impacts"] = clock.lap()
     again: ProblemOf = partial(problem_for, meets=meets)
-    if unnamed and is_driven(scene, decided):
+    if result.verdict == "gap_unnamed" and is_driven(scene, decided):
         was, what = problem, "comparing in another way"
         problem, selection, result = budget.if_time(
             what, in_another_way, (problem, selection, result)
