@@ -167,8 +167,10 @@ def test_contact_that_takes_too_long_leaves_time_for_what_is_free(case, monkeypa
         while True:
             budgets.go_on()
 
-    touching = ((lambda *_: True, endless),)
-    monkeypatch.setattr(workflow, "_WHERE_IT_TOUCHES", touching)
+    monkeypatch.setattr(workflow, "push_each_other", lambda *_: False)
+    monkeypatch.setattr(workflow, "presses", lambda *_: False)
+    monkeypatch.setattr(workflow, "runs_against", lambda *_: True)
+    monkeypatch.setattr(workflow, "_impact_problem", endless)
     scene, recordings = read_scene(case[0]), read_recordings([case[1]])
     with Budget(1.0).running() as budget:
         problem, _ = workflow.problem_for(scene, recordings, SceneDynamics(scene))
