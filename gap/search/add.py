@@ -5,14 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from makebreak.gap.fit import tangents
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Candidate, Fitted
 from makebreak.gap.result import Considered
 from makebreak.gap.search.choice import (
     Choice,
     Trial,
-    fixed_parameters,
     places,
     why_not,
 )
@@ -133,9 +131,7 @@ def _ranked(
     """Candidates by their columns, the best first, while the parameters of all that is
     chosen are free to adjust, to first order; with the screen that ranked them, and the
     rms that the best leaves, against which nuisances are weighed."""
-    slopes = np.zeros((len(current.r), 0))
-    if chosen and not search.plan.jumps:
-        slopes, _ = tangents(search.problem, current, fixed_parameters(chosen))
+    slopes, _ = search.slopes(chosen, current)
     wide = search.screen(current.r, slopes=slopes)
     ranked = [r for r in rank(wide, free) if r.valid]
     scale = 1.0

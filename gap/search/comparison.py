@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from makebreak.gap.budget import present
-from makebreak.gap.fit import fit_effects
+from makebreak.gap.fit import fit_effects, tangents
 from makebreak.gap.numerics.selection import (
     Screen,
     by_block,
@@ -79,6 +79,16 @@ class Comparison:
             columns = np.hstack([columns, slopes])
             prior = np.append(prior, np.full(slopes.shape[1], FREE_TOLERANCE))
         return Screen(r, columns, prior, self.train, scale, limit)
+
+    def slopes(
+        self, chosen: Sequence[Choice], current: Fitted, problem=None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """As of fit.tangents, by this problem's or another one's weights; none where
+        the error jumps, as slopes tell nothing then."""
+        if not chosen or self.plan.jumps:
+            return np.zeros((len(current.r), 0)), np.zeros(0, int)
+        fixed = fixed_parameters(chosen)
+        return tangents(problem or self.problem, current, fixed)
 
     # ----- Errors
 

@@ -5,13 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from makebreak.gap.fit import fit_effects, tangents
+from makebreak.gap.fit import fit_effects
 from makebreak.gap.problem import Candidate, Fitted, is_sane
 from makebreak.gap.search.choice import (
     Choice,
     called,
     deviations_off,
-    fixed_parameters,
     is_clearly_off,
     is_significant,
     places,
@@ -45,9 +44,7 @@ def drop_needless(
         alike = search.problem.weighed_by(current.effects)
         problem = search.problem if alike is None else alike
         left = screen.fit_nuisances(current.r)[1]
-        slopes, of = np.zeros((len(left), 0)), np.zeros(0, int)
-        if not search.plan.jumps:
-            slopes, of = tangents(problem, current, fixed_parameters(chosen))
+        slopes, of = search.slopes(chosen, current, problem)
         needless: list[tuple[float, int, Fitted]] = []
         for k in range(len(chosen)):
             if search.plan.alike and _is_beyond_doubt(search, chosen, current, k):

@@ -6,12 +6,10 @@ from itertools import combinations
 
 import numpy as np
 
-from makebreak.gap.fit import tangents
 from makebreak.gap.problem import Candidate, Fitted
 from makebreak.gap.search.choice import (
     Choice,
     Trial,
-    fixed_parameters,
     places,
     refreshed,
 )
@@ -64,9 +62,7 @@ def _best(
         c for c in search.problem.candidates(search.nuisances, current)
         if (c.kind, c.at) not in taken
     ]  # fmt: skip
-    slopes, of = np.zeros((len(current.r), 0)), np.zeros(0, int)
-    if not search.plan.jumps:
-        slopes, of = tangents(search.problem, current, fixed_parameters(chosen))
+    slopes, of = search.slopes(chosen, current)
     for i, j in pairs:
         others = [c for k, c in enumerate(chosen) if k != j]
         without = replace(
