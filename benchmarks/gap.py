@@ -1,12 +1,8 @@
 """Time of `makebreak gap` on one minute of a Panda's motion at 200 rows per second."""
 
-import json
-import resource
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from time import perf_counter
 
 import numpy as np
 from pydrake.multibody.parsing import Parser
@@ -14,10 +10,11 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import MultibodyForces
 
 import makebreak
+from makebreak.benchmarks import driven as bench_driven
 from makebreak.benchmarks import sysid as bench_sysid
+from makebreak.benchmarks.rows import run_gap
 from makebreak.diagrams.scene_facts import PANDA_JOINTS
 from makebreak.gap.data.table import write_recording
-from makebreak.scripts.runner.trials import makebreak_command
 
 DURATION_SEC, RATE_HZ = 60.0, 200.0
 TARGET_SEC = 120.0  # Wall time on two cores.
@@ -128,15 +125,9 @@ def rows() -> list[dict]:
     """Wall time of the command, and CPU time of all its processes [s]."""
     with TemporaryDirectory() as folder:
         scene, recording = record(Path(folder))
-        out = Path(folder) / "out"
-        words = ("gap", str(scene), str(recording), "--out", str(out))
-        command = makebreak_command(*words)
-        before, start = _cpu_of_children(), perf_counter()
-        done = subprocess.run(command, capture_output=True, text=True)
-        wall, cpu = perf_counter() - start, _cpu_of_children() - before
-        if done.returncode:
-            raise RuntimeError(done.stderr.strip().splitlines()[-1])
-        result = json.loads((out / "result.json").read_text())
+        result, wall, cpu = run_gap(
+            str(scene), str(recording), out=Path(folder) / "out"
+        )
     found = ", ".join(f"{e['kind']} at {e['at']}" for e in result["effects"])
     what = f"gap, {DURATION_SEC:.0f} s of 7 joints at {RATE_HZ:.0f} Hz"
     note = f"{result['verdict']}: {found or 'nothing'}"
@@ -146,9 +137,4 @@ def rows() -> list[dict]:
          "target": f"<= {TARGET_SEC:.0f}", "met": met},
         {"what": f"{what}, CPU time", "value": cpu, "unit": "s"},
     ]  # fmt: skip
-    return rows + bench_sysid.rows()
-
-
-def _cpu_of_children() -> float:
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
+    return rows + bench_sysid.rows() + bench_driven.rows()

@@ -88,7 +88,7 @@ def score(
     verdicts = truth.get("verdicts") or [truth["verdict"]]
     hidden = [] if verdicts == ["gap_unnamed"] else truth["effects"]
     whole = {h["kind"] for h in hidden if "." not in str(h["at"])}
-    found = _members(result.get("effects") or [], driven, whole)
+    found = members(result.get("effects") or [], driven, whole)
     asked = any(h.get("needed", True) for h in hidden)
     first = tied = None
     if asked:
@@ -153,7 +153,7 @@ def score(
 _EACH = ("joint_", "rotor_inertia", "servo_gain", "actuator_gain", "actuator_bias")
 
 
-def _members(
+def members(
     effects: Sequence[Mapping], driven: Sequence[str], whole: Collection[str] = ()
 ) -> list[Mapping]:
     """The effects, with one on several joints, or on all of a model, as one on each of

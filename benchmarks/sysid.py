@@ -20,11 +20,13 @@ import re
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import redirect_stdout
 from dataclasses import dataclass, field
 from importlib.util import find_spec
+from io import StringIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from time import perf_counter, process_time
+from time import process_time
 
 import numpy as np
 import yaml
@@ -33,7 +35,7 @@ from scipy.signal import savgol_filter
 
 from makebreak.benchmarks.gap_benchmark import SETS, check
 from makebreak.benchmarks.gap_scoring import score
-from makebreak.scripts.runner.trials import makebreak_command
+from makebreak.benchmarks.rows import run_gap
 
 CASES = (
     "01_arm_none", "02_pendulum_none", "13_pendulum_joint_coulomb_friction",
@@ -122,28 +124,36 @@ def read_case(folder: Path) -> Problem:
     return problem
 
 
-def _spec(problem: Problem):
-    """The URDF as an MjSpec, with motors, rotors, and sensors of every joint."""
+def read_robot(urdf: str):
+    """The URDF's links and joints as an MjSpec, and {joint: its rotor [kg m2]}."""
     import mujoco
 
-    plain = re.sub(r"<transmission.*?</transmission>", "", problem.urdf, flags=re.S)
+    plain = re.sub(r"<transmission.*?</transmission>", "", urdf, flags=re.S)
     plain = re.sub(r"<visual>.*?</visual>", "", plain, flags=re.S)
     head = '<mujoco><compiler fusestatic="false" balanceinertia="false"/></mujoco>'
     plain = plain.replace("<link", f"{head}<link", 1)
     spec = mujoco.MjSpec.from_string(plain)
+    texts = re.findall(
+        r'<joint name="(\w+)"/><actuator[^>]*>\s*<drake:rotor_inertia value='
+        r'"([^"]+)"',
+        urdf,
+    )
+    rotors = {joint: float(text) for joint, text in texts}
+    for joint, rotor in rotors.items():
+        spec.joint(joint).armature = rotor
+    return spec, rotors
+
+
+def _spec(problem: Problem):
+    """The robot with motors, and sensors of every joint; its rotors."""
+    import mujoco
+
+    spec, rotors = read_robot(problem.urdf)
     spec.option.timestep = STEP_SEC
     # The errors of MuJoCo's first-order integrators are a hundred times the noise.
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
-    rotors = dict(
-        re.findall(
-            r'<joint name="(\w+)"/><actuator[^>]*>\s*<drake:rotor_inertia value='
-            r'"([^"]+)"',
-            problem.urdf,
-        )
-    )
     for name in problem.joints:
         joint = name.split(".")[1]
-        spec.joint(joint).armature = float(rotors.get(joint, 0.0))
         motor = spec.add_actuator(
             name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT
         )
@@ -281,6 +291,16 @@ def _sequences(problem: Problem, spec):
     return sysid.ModelSequences("case", spec, names, starts, controls, sensors)
 
 
+def optimize(free, residual, **options):
+    """The toolbox's own optimiser, which prints each step whatever it is told."""
+    from mujoco import sysid
+
+    with redirect_stdout(StringIO()):
+        return sysid.optimize(
+            free, residual, optimizer="mujoco", verbose=False, x_scale="jac", **options
+        )
+
+
 def fit(problem: Problem, jobs: int = 1) -> Fit:
     """Runs the toolbox on a case."""
     from mujoco import sysid
@@ -316,9 +336,7 @@ def fit(problem: Problem, jobs: int = 1) -> Fit:
         n_threads=jobs,
         resample_true=False,
     )
-    best, result = sysid.optimize(
-        free, residual, optimizer="mujoco", verbose=False, x_scale="jac", max_iters=20
-    )
+    best, result = optimize(free, residual, max_iters=20)
     final, _, _ = residual(best.as_vector(), best)
     _, intervals = sysid.calculate_intervals([np.ravel(r) for r in final], result.jac)
     values = dict(zip(_names(best), best.as_vector(), strict=True))
@@ -382,40 +400,37 @@ def rows(cases: Sequence[str] = CASES) -> list[dict]:
     if not available():
         return [{"what": what, "note": "left out: pip install 'makebreak[sysid]'"}]
     found: list[dict] = []
-    with TemporaryDirectory() as text:
-        folder = Path(text)
-        for case in cases:
-            made, truth_file = folder / "cases", folder / f"{case}.json"
-            words = [sys.executable, str(SETS["development"].maker), "--set",
-                     "development", "--only", case, "--out", str(made), "--truth",
-                     str(truth_file)]  # fmt: skip
-            subprocess.run(words, check=True, capture_output=True)
-            [(name, truth)] = json.loads(truth_file.read_text()).items()
-            found += _rows_of(made / name, folder / "out" / name, truth)
+    with TemporaryDirectory() as folder:
+        for name in cases:
+            case, truth = make_case("development", name, Path(folder))
+            found += _rows_of(case, Path(folder) / "out" / name, truth)
     return found
+
+
+def make_case(which: str, name: str, folder: Path) -> tuple[Path, dict]:
+    """Makes one case of a set of the benchmark. Returns: its folder, what is hidden."""
+    made, truth = folder / "cases", folder / f"{name}.json"
+    words = [sys.executable, str(SETS[which].maker), "--set", which, "--only", name]
+    words += ["--out", str(made), "--truth", str(truth)]
+    subprocess.run(words, check=True, capture_output=True)
+    [(there, hidden)] = json.loads(truth.read_text()).items()
+    return made / there, hidden
 
 
 def _rows_of(case: Path, out: Path, truth: Mapping) -> list[dict]:
     hidden = ", ".join(f"{e['kind']} at {e['at']}" for e in truth["effects"])
     what = f"{truth['name']} ({hidden or 'nothing hidden'})"
-    words = ("gap", str(case / "scene.yaml"), str(case / "recording.csv"))
-    begin = perf_counter()
-    command = makebreak_command(*words, "--jobs", "1", "--out", str(out))
-    subprocess.run(command, check=True, capture_output=True)
-    seconds = perf_counter() - begin
-    result = json.loads((out / "result.json").read_text())
+    files = (str(case / "scene.yaml"), str(case / "recording.csv"))
+    result, _, seconds = run_gap(*files, "--jobs", "1", out=out)
     ours = score(truth, result)
     error = f"error {max(ours.errors):.1%}; " if ours.errors else ""
     note = f"{ours.found}: {ours.says}; {error}{ours.extra} invented"
     rows = [{"what": f"{what}: makebreak gap", "value": seconds, "unit": "s",
              "note": note}]  # fmt: skip
-    problem = read_case(case)
-    begin = perf_counter()
-    found = fit(problem)
-    seconds = perf_counter() - begin
+    found = fit(read_case(case))
     errors, off, others = compare(found, truth)
     text = f"error {max(errors.values()):.1%}; " if errors else ""
     note = f"{text}{off} of {others} others outside their intervals; names no effect"
-    rows.append({"what": f"{what}: mujoco.sysid", "value": seconds, "unit": "s",
+    rows.append({"what": f"{what}: mujoco.sysid", "value": found.seconds, "unit": "s",
                  "note": note})  # fmt: skip
     return rows

@@ -152,11 +152,14 @@ def robot_of(kind: str, rng) -> Robot:
 # ----- The world
 
 
-def model_of(robot: Robot, damping=0.0, friction=0.0, dry: str = HARD):
-    """(model, data, (n,) index of each joint)."""
+def mjcf_of(robot: Robot, damping=0.0, friction=0.0, dry: str = HARD) -> str:
     n = len(robot.joints)
-    text = to_mjcf(robot, (0, 0, -G), np.full(n, damping), np.full(n, friction), None,
+    return to_mjcf(robot, (0, 0, -G), np.full(n, damping), np.full(n, friction), None,
                    f'timestep="{STEP}"', dry)  # fmt: skip
+
+
+def model_of(robot: Robot, text: str):
+    """(model, data, (n,) index of each joint) of the robot that is written so."""
     model = mujoco.MjModel.from_xml_string(text)
     at = [model.joint(body.joint).dofadr[0] for body in robot.moving]
     return model, mujoco.MjData(model), np.array(at)
@@ -164,7 +167,7 @@ def model_of(robot: Robot, damping=0.0, friction=0.0, dry: str = HARD):
 
 def inertias(robot: Robot) -> np.ndarray:
     """(n,) of each joint, rotors with them [kg m2], about the middle of its motion."""
-    model, data, at = model_of(robot)
+    model, data, at = model_of(robot, mjcf_of(robot))
     data.qpos[at] = robot.middle
     mujoco.mj_forward(model, data)
     full = np.zeros((model.nv, model.nv))
@@ -172,13 +175,11 @@ def inertias(robot: Robot) -> np.ndarray:
     return np.diag(full)[at]
 
 
-def run(
-    true: Robot, nominal: Robot, drives: Drive, dry: str, effects, known, motion: Motion
-):
-    """(time, q, v, effort, commands {name: (k, n)}), each 1 ms. known (n,): friction
-    that the scene has. Raises: RuntimeError where bodies touch."""
-    n, kp, delay = len(true.joints), drives.kp.copy(), 0.0
-    damping, friction = np.zeros(n), known.copy()
+def with_effects(true: Robot, drives: Drive, dry: str, effects, known):
+    """The robot as MJCF, its gains kp (n,) and its delay [s], with what is hidden.
+    known (n,): friction that the scene has."""
+    kp, delay = drives.kp.copy(), 0.0
+    damping, friction = np.zeros(len(true.joints)), known.copy()
     for e in effects:
         x = next(iter(e["parameters"].values()))
         if e["kind"] == "input_delay":
@@ -196,8 +197,17 @@ def run(
             else:
                 body = true.moving[i]
                 true = true.with_body(f"robot.{body.name}", rotor=body.rotor + x)
-    m, d, dof = model_of(true, damping, friction, dry)
-    model, plain, at = model_of(nominal)
+    return mjcf_of(true, damping, friction, dry), kp, delay
+
+
+def run(
+    true: Robot, nominal: Robot, drives: Drive, dry: str, effects, known, motion: Motion
+):
+    """(time, q, v, effort, commands {name: (k, n)}), each 1 ms. known (n,): friction
+    that the scene has. Raises: RuntimeError where bodies touch."""
+    text, kp, delay = with_effects(true, drives, dry, effects, known)
+    m, d, dof = model_of(true, text)
+    model, plain, at = model_of(nominal, mjcf_of(nominal))
     d.qpos[dof], d.qvel[dof] = motion.q[0], motion.v[0]
     every, late = round(drives.period / STEP), round(delay / STEP)
     queue: list[tuple] = []
@@ -351,7 +361,9 @@ def make(case: DrivenCase, attempt: int = 0):
         verdicts.append("ambiguous")
     truth = dict(name=case.name, verdict=verdicts[0], verdicts=verdicts, ties=[],
                  effects=effects, robot=case.robot, rate_hz=log_hz, commands_hz=hz,
-                 kinds=sorted({e["kind"] for e in effects}))  # fmt: skip
+                 kinds=sorted({e["kind"] for e in effects}),
+                 world=with_effects(world[0], drives, world[3], effects, known)[0],
+                 )  # fmt: skip
     scene = _scene(robot, drives, known, com)
     return columns, scene, to_urdf(robot), sidecar, truth
 
