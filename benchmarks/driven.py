@@ -70,6 +70,7 @@ class Search:
         self.start = 2.0 * (start - self._low) / (self._high - self._low) - 1.0
 
     def values(self, u: np.ndarray) -> Values:
+        """The values at u (m,); those that are not free are the model's."""
         vector = self._rig.values.vector()
         share = 0.5 * (1.0 + np.clip(u, -1.0, 1.0))
         vector[self._free] = self._low + (self._high - self._low) * share
@@ -178,9 +179,9 @@ def false_of(found: Values, rig: Rig, true: Values, log: Log) -> list[str]:
 
 def errors_of(found: Values, given: Values, true: Values) -> np.ndarray:
     """Of each number that the given model has wrong, the error over the model's."""
-    x, given, right = (v.vector() for v in (found, given, true))
-    wrong = ~np.isclose(given, right)
-    return np.abs(x - right)[wrong] / np.abs(given - right)[wrong]
+    x, start, right = (v.vector() for v in (found, given, true))
+    wrong = ~np.isclose(start, right)
+    return np.abs(x - right)[wrong] / np.abs(start - right)[wrong]
 
 
 def rows(cases: Sequence[str] = CASES) -> list[dict]:

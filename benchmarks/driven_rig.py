@@ -49,6 +49,7 @@ class Log:
         return q, v, a
 
     def first(self, rows: int) -> "Log":
+        """The log without its later rows."""
         cut = {k: getattr(self, k)[:rows] for k in ("time", "q", "goal", "rate")}
         return replace(self, **cut)
 
@@ -66,10 +67,12 @@ class Values:
     delay: np.ndarray
 
     def vector(self) -> np.ndarray:
+        """(5 n + 1,), in this order."""
         return np.concatenate([getattr(self, f.name) for f in fields(self)])
 
     @classmethod
     def of(cls, vector: np.ndarray) -> "Values":
+        """The values of such a vector."""
         n = (len(vector) - 1) // 5
         return cls(*np.split(vector, n * np.arange(1, 6)))
 
