@@ -68,6 +68,7 @@ from makebreak.systems.arm.wrench_tare import WrenchTare, WrenchTareConfig
 from makebreak.systems.changing_contact.contact_anticipator import (
     ContactAnticipatorConfig,
     KalmanContactAnticipator,
+    KnownReflexConfig,
 )
 from makebreak.systems.changing_contact.contact_detector import (
     ContactDetector,
@@ -315,8 +316,8 @@ def _add_systems(
     known: Knowledge,
 ) -> _Systems:
     # The approach speed of the anticipator depends on how hard the reflex brakes.
-    own = ("reflex_gain", "reflex_force_least", "reflex_force_known")
-    refuse_changed("anticipator.speed", config.anticipator.speed, own)
+    reflex = config.anticipator.speed.reflex
+    refuse_changed("anticipator.speed.reflex", reflex, list(vars(reflex)))
     # What variable_impedance and the damping ratio give instead.
     unused = ["stiffness", *(["damping"] if config.hybrid.damping_ratio > 0.0 else [])]
     refuse_changed("impedance", config.impedance, unused)
@@ -330,9 +331,9 @@ def _add_systems(
             )
     speed = replace(
         config.anticipator.speed,
-        reflex_gain=config.reflex.gain,
-        reflex_force_least=config.reflex.force_least,
-        reflex_force_known=config.reflex.force_known,
+        reflex=KnownReflexConfig(
+            config.reflex.gain, config.reflex.force_least, config.reflex.force_known
+        ),
     )
     anticipator = replace(config.anticipator, speed=speed)
     add = builder.AddNamedSystem

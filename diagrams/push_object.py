@@ -545,9 +545,9 @@ def _switchable(
 
 def _add_touch_down(builder, config, model, planning, estimator, reference) -> None:
     """The learned speed of a touch, which slows the reference before one."""
-    if config.touch.most > config.reference.limits.push_speed:
+    if config.touch.speed.most > config.reference.limits.push_speed:
         raise ValueError(
-            f"touch.most is {config.touch.most}, expected at most "
+            f"touch.speed.most is {config.touch.speed.most}, expected at most "
             f"reference.limits.push_speed, {config.reference.limits.push_speed} m/s"
         )
     touch = builder.AddNamedSystem(

@@ -42,7 +42,11 @@ from makebreak.systems.contact_mpc.numerics.contact_sampling import (
     ObjectShape,
     SamplingConfig,
 )
-from makebreak.systems.contact_mpc.numerics.push_task import PushConfig
+from makebreak.systems.contact_mpc.numerics.push_task import (
+    PushConfig,
+    TravelConfig,
+    UnseenConfig,
+)
 from makebreak.systems.contact_mpc.path_target import PathTarget, PathTargetConfig
 from makebreak.systems.contact_mpc.push_task import PushTask, PushTaskConfig
 
@@ -92,7 +96,10 @@ class SampledContactsConfig:
     )
     push: PushConfig = field(
         default_factory=lambda: PushConfig(
-            believed_sec=0.5, follow=True, place_change=0.0, around=True
+            TravelConfig(around=True),
+            unseen=UnseenConfig(believed_sec=0.5),
+            follow=True,
+            place_change=0.0,
         )
     )
     # Q_d of the ball's v_x and v_y [s2/m2]; 2e4: a standard deviation of 7 mm/s. The

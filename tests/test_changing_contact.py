@@ -239,8 +239,8 @@ def test_periods_are_the_diagrams():
 
 def test_the_anticipator_has_the_gain_of_the_reflex_and_no_other():
     config = ChangingContactConfig()
-    config.anticipator.speed.reflex_gain = 3.0
-    message = "anticipator.speed.reflex_gain is 3.0, expected 0.0: the diagram sets it"
+    config.anticipator.speed.reflex.gain = 3.0
+    message = "anticipator.speed.reflex.gain is 3.0, expected 0.0: the diagram sets it"
     with pytest.raises(ValueError, match=message):
         build(config=config)
 

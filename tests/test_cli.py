@@ -279,6 +279,8 @@ def test_an_unknown_key_is_a_short_line_that_begins_with_what_is_near(name):
     [
         ("task.rolling.roll_sec", "task.rolling.roll.sec"),
         ("task.rolling.withdraw_speed", "task.rolling.unseen.withdraw_speed"),
+        ("contacts.push.unseen_sec", "contacts.push.unseen.sec"),
+        ("contacts.push.room", "contacts.push.travel.room"),
         ("contacts.reference.touch_speed", "contacts.reference.touch.speed"),
         ("contacts.reference.speed_max", "contacts.reference.limits.speed_max"),
     ],

@@ -12,6 +12,7 @@ from makebreak.systems.changing_contact.contact_anticipator import (
     ContactAnticipatorConfig,
     ContactFilterConfig,
     KalmanContactAnticipator,
+    KnownReflexConfig,
 )
 from makebreak.systems.changing_contact.numerics.contact_anticipator import (
     BEND,
@@ -239,7 +240,7 @@ def test_what_was_never_felt_is_met_as_the_stiffest_surface_asks(gain):
         return 9.0 if abs(d[2]) > 0.5 else 4.0
 
     speed = ApproachSpeedConfig(
-        stiffness_most=1e5, force_first=6.0, reflex_gain=gain, reflex_force_least=2.0
+        stiffness_most=1e5, force_first=6.0, reflex=KnownReflexConfig(gain, 2.0)
     )
     wall = ExpectedContact([0.5, 0.3, 0], 0.08**2 * np.eye(3), RIGHT, segment=1)
     config = ContactAnticipatorConfig(speed=speed)

@@ -69,6 +69,7 @@ from makebreak.systems.contact_mpc.numerics.push_task import (
     WAIT,
     PushConfig,
     PushState,
+    TravelConfig,
     angle_between,
     errors,
     heading,
@@ -635,10 +636,11 @@ def test_what_the_arm_hides_on_its_way_is_gone_to_and_pushed_a_little(planner):
             break
     n = [phases.count(phase) * 0.0125 for phase in (TRAVEL, CONTACT)]
     assert phases == sorted(phases, key=[TRAVEL, CONTACT, WAIT].index)
-    assert config.unseen_sec < n[0] < config.believed_sec
-    assert n[1] == pytest.approx(config.unseen_sec, abs=0.03)
+    assert config.unseen.sec < n[0] < config.unseen.believed_sec
+    assert n[1] == pytest.approx(config.unseen.sec, abs=0.03)
     # And not for ever, where the place is far away.
-    slow, x = PushConfig(speed=0.01), state([0.35, 0.0, 0.1], (0.5, 0.0, 0.3))
+    slow = PushConfig(TravelConfig(speed=0.01))
+    x = state([0.35, 0.0, 0.1], (0.5, 0.0, 0.3))
     task = PushState(TRAVEL, x[P_TIP].copy(), np.zeros(3), np.zeros(3))
     ticks = 0
     while task.phase == TRAVEL and ticks < 400:
@@ -647,7 +649,7 @@ def test_what_the_arm_hides_on_its_way_is_gone_to_and_pushed_a_little(planner):
         )
         ticks += 1
     assert task.phase == WAIT
-    assert 0.0125 * ticks == pytest.approx(slow.believed_sec, abs=0.03)
+    assert 0.0125 * ticks == pytest.approx(slow.unseen.believed_sec, abs=0.03)
 
 
 def test_an_object_out_of_reach_is_not_followed(planner):
@@ -696,7 +698,7 @@ def test_the_task_travels_pushes_and_waits_for_what_is_not_seen(planner):
             break
         assert task.phase == TRAVEL
     # Down slowly from where it may hit something; the last step of braking is on it.
-    assert 0.06 < max(falls) < config.descent + 2.0 * 0.0125
+    assert 0.06 < max(falls) < config.travel.descent + 2.0 * 0.0125
     np.testing.assert_allclose(x[P_TIP], [*place, HEIGHT], atol=2e-3)
     for _ in range(20):
         task = tick(task)
@@ -710,7 +712,7 @@ def test_the_task_travels_pushes_and_waits_for_what_is_not_seen(planner):
     for _ in range(200):
         task = tick(task, seen=False)
     assert task.phase == WAIT
-    assert task.p[2] > 0.07 and np.hypot(*(task.p[:2] - config.withdrawn)) < 0.01
+    assert task.p[2] > 0.07 and np.hypot(*(task.p[:2] - config.unseen.withdrawn)) < 0.01
 
 
 def test_a_tip_comes_down_farther_out_and_goes_in_along_the_table(planner):
@@ -754,7 +756,7 @@ def test_a_tip_comes_down_farther_out_and_goes_in_along_the_table(planner):
 def test_a_tip_that_comes_down_on_the_object_goes_up_and_comes_down_farther_out(
     planner,
 ):
-    shape, config = planner[2], PushConfig(room=0.0)
+    shape, config = planner[2], PushConfig(TravelConfig(room=0.0))
     x = state([0.35, 0.0, 0.1], (0.5, 0.0, 0.3))
     place = places_of(planner)[0][0, :2]
     in_object = to_object(x, place)

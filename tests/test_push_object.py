@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from operator import attrgetter
 
 import numpy as np
 import pytest
@@ -33,7 +34,10 @@ from makebreak.models.effects.kind import Effect
 from makebreak.models.pushed_object import PushedObject, object_file
 from makebreak.models.scene import read_scene
 from makebreak.models.scene_file import write_scene
-from makebreak.systems.changing_contact.touch_down import TouchDownConfig
+from makebreak.systems.changing_contact.numerics.touch_down import (
+    TouchDownConfig,
+    TouchSpeedConfig,
+)
 from makebreak.systems.contact_mpc.numerics.ball_state import N_X, P_BALL, Q_BALL
 from makebreak.systems.contact_mpc.numerics.parameter_posterior import Belief
 from makebreak.systems.contact_mpc.numerics.push_task import (
@@ -520,10 +524,9 @@ def test_a_gentle_touch_is_wired_and_its_speed_is_checked(gentle):
     context = diagram.CreateDefaultContext()
     assert port.HasValue(reference.GetMyContextFromRoot(context)) == gentle
     if gentle:
-        with pytest.raises(ValueError, match="touch.most is 0.3, expected at most"):
-            make_push_object(
-                PushObjectConfig(gentle=True, touch=TouchDownConfig(most=0.3))
-            )
+        fast = TouchDownConfig(speed=TouchSpeedConfig(most=0.3))
+        with pytest.raises(ValueError, match="touch.speed.most is 0.3, expected at"):
+            make_push_object(PushObjectConfig(gentle=True, touch=fast))
 
 
 def test_what_the_learner_of_parameters_knows_is_planned_with():
@@ -578,15 +581,15 @@ def test_nothing_to_learn_is_refused(settings, said):
         ({"pose_from": "sensor"}, "learning.weight_late", 100.0),
         ({"pose_from": "camera"}, "pose.delay_sec", 0.05),
         ({"pose_from": "camera"}, "learning.weight", 100.0),
-        ({"gentle": False}, "touch.most", 0.1),
+        ({"gentle": False}, "touch.speed.most", 0.1),
         ({}, "planner.coast_sec", 2.0),
     ],
 )
 def test_a_setting_that_the_chosen_parts_do_not_read_is_refused(choice, setting, value):
     config = PushObjectConfig(camera=CameraConfig(renderer="drawn"), **choice)
     make_push_object(config)
-    part, name = setting.split(".")
-    setattr(getattr(config, part), name, value)
+    part, _, name = setting.rpartition(".")
+    setattr(attrgetter(part)(config), name, value)
     ((key, chosen),) = (choice or {"object.shape": "t"}).items()
     why = rf"^{setting} is {value}, expected .*: not used with {key}={chosen}$"
     with pytest.raises(ValueError, match=re.compile(why, re.IGNORECASE)):

@@ -54,6 +54,7 @@ from makebreak.systems.contact_mpc.numerics.push_task import (
     WAIT,
     PushConfig,
     PushState,
+    TravelConfig,
     next_push,
 )
 from makebreak.systems.contact_mpc.numerics.rolling_task import CirclePath
@@ -255,7 +256,7 @@ def travelled(v, config, seconds=1.0, inside=0.0, nearer=0.0):
 
 
 def test_the_way_beside_a_ball_that_rolls_is_that_beside_one_at_rest():
-    config = PushConfig(follow=True, around=True)
+    config = PushConfig(TravelConfig(around=True), follow=True)
     at_rest, end = travelled([0.0, 0.0], config)
     moving, end_moving = travelled([0.05, -0.03], config)
     assert end.phase == end_moving.phase == CONTACT
@@ -264,12 +265,12 @@ def test_the_way_beside_a_ball_that_rolls_is_that_beside_one_at_rest():
     _, lags = travelled([0.05, -0.03], replace(config, follow=False))
     assert np.linalg.norm(end_moving.v[:2] - [0.05, -0.03]) < 0.02
     assert np.linalg.norm(lags.v[:2]) < 0.02
-    _, over = travelled([0.0, 0.0], replace(config, around=False), 0.3)
+    _, over = travelled([0.0, 0.0], replace(config, travel=TravelConfig()), 0.3)
     assert over.p[2] > HEIGHT + 0.01 and end.p[2] == pytest.approx(HEIGHT, abs=2e-3)
 
 
 def test_a_ball_that_is_learned_to_be_smaller_is_passed_and_reached_nearer():
-    config = PushConfig(follow=True, around=True)
+    config = PushConfig(TravelConfig(around=True), follow=True)
     rows, end = travelled([0.0, 0.0], config, inside=0.004, nearer=-0.005)
     assert end.phase == CONTACT
     far = np.hypot(*(rows[:, :2] - [0.5, 0.0]).T)
@@ -282,7 +283,7 @@ def test_a_ball_that_is_learned_to_be_smaller_is_passed_and_reached_nearer():
 
 def test_a_task_without_a_learned_distance_takes_the_shape_as_it_is_modelled():
     start = [0.5, -0.056, HEIGHT]
-    config = PushTaskConfig(PushConfig(follow=True, around=True), HEIGHT)
+    config = PushTaskConfig(PushConfig(TravelConfig(around=True), follow=True), HEIGHT)
 
     def reference(nearer):
         """The tip's after half a second of travelling to the ball's other side."""
@@ -502,7 +503,7 @@ def _set(config, setting, value):
     ("choice", "setting", "value"),
     [
         ({}, "contacts.gap_allowance", 0.002),
-        ({}, "contacts.push.speed", 0.5),
+        ({}, "contacts.push.travel.speed", 0.5),
         ({"contact_sequence": "sampled"}, "task.rolling.reposition.lift", 0.02),
         ({"contact_sequence": "sampled"}, "task.speed", 0.03),
         ({"contact_sequence": "sampled"}, "planner.N", 6),
@@ -583,4 +584,4 @@ def test_zero_is_no_bad_weight_drift_or_allowance():
 
 def test_rounds_of_things_that_lie_still_are_as_before():
     assert not SamplingConfig().follow
-    assert not PushConfig().follow and not PushConfig().around
+    assert not PushConfig().follow and not TravelConfig().around

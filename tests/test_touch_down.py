@@ -4,6 +4,8 @@ from pydrake.systems.analysis import Simulator
 
 from makebreak.systems.changing_contact.numerics.touch_down import (
     TouchDownConfig,
+    TouchPlaceConfig,
+    TouchSpeedConfig,
     allowed_speed,
     first_state,
     next_touch,
@@ -43,12 +45,12 @@ def touches(n, side, slope, config=C, mass_force=0.0, start=0.03):
 @pytest.mark.parametrize("slope", [60.0, 160.0, 500.0])
 def test_impacts_have_the_desired_force_after_some_touches(slope):
     _, speeds = touches(12, 0.0, slope)
-    assert speeds[0] == pytest.approx(C.first, rel=0.02)
+    assert speeds[0] == pytest.approx(C.speed.first, rel=0.02)
     peaks = slope * speeds * np.sin(np.linspace(0.2, np.pi, 12)).max()
-    expected = min(C.force_desired, slope * C.most)
+    expected = min(C.force_desired, slope * C.speed.most)
     np.testing.assert_allclose(peaks[-3:], expected, rtol=0.05)
-    assert (speeds[1:] <= C.growth * speeds[:-1] + 1e-9).all()
-    assert (speeds >= C.least).all() and (speeds <= C.most + 1e-12).all()
+    assert (speeds[1:] <= C.speed.growth * speeds[:-1] + 1e-9).all()
+    assert (speeds >= C.speed.least).all() and (speeds <= C.speed.most + 1e-12).all()
 
 
 @pytest.mark.parametrize("side", [-0.006, 0.0, 0.004])
@@ -57,31 +59,33 @@ def test_the_distance_of_a_touch_is_learned_and_the_region_shrinks(side):
     means = np.array([s.mean for s in states])
     # A tick of the way: the touch is felt up to 0.6 mm late.
     assert abs(means[-1] - side) < 1e-3
-    assert states[0].variance < C.std_first**2
+    assert states[0].variance < C.place.std_first**2
     assert states[-1].variance < states[0].variance
     # It is Kalman's steady state: P+ = P R / (P + R), P = P+ + Q.
-    Q, R = C.std_drift**2, C.std_measured**2
+    Q, R = C.place.std_drift**2, C.place.std_measured**2
     posterior = 0.5 * (-Q + np.sqrt(Q**2 + 4.0 * Q * R))
     assert states[-1].variance == pytest.approx(posterior, rel=1e-3)
 
 
 def test_speed_falls_before_the_region_and_not_after_it():
     state = first_state(C)
-    half = C.sigmas * np.sqrt(C.std_first**2 + C.std_drift**2 + C.std_measured**2)
+    place = C.place
+    variance = place.std_first**2 + place.std_drift**2 + place.std_measured**2
+    half = place.sigmas * np.sqrt(variance)
     distance = np.linspace(-0.02, 0.04, 601)
     speed = np.array([allowed_speed(C, state, d) for d in distance])
     assert (np.diff(speed) >= 0.0).all()
-    np.testing.assert_allclose(speed[distance <= half], C.first)
-    np.testing.assert_allclose(speed[distance >= half + C.brake], C.most)
-    middle = allowed_speed(C, state, half + 0.5 * C.brake)
-    assert middle == pytest.approx(0.5 * (C.first + C.most))
+    np.testing.assert_allclose(speed[distance <= half], C.speed.first)
+    np.testing.assert_allclose(speed[distance >= half + C.speed.brake], C.speed.most)
+    middle = allowed_speed(C, state, half + 0.5 * C.speed.brake)
+    assert middle == pytest.approx(0.5 * (C.speed.first + C.speed.most))
 
 
 def test_what_a_travelling_tip_feels_is_no_touch():
     state = first_state(C)
     for _ in range(100):
         state = next_touch(C, state, DT, 0.01, 0.3, 20.0, False)
-    assert state.impacts == () and state.mean == 0.0 and state.speed == C.first
+    assert state.impacts == () and state.mean == 0.0 and state.speed == C.speed.first
     # And a push that goes on is one touch, however long.
     for force in (0.0,) * 20 + (5.0,) * 100:
         state = next_touch(C, state, DT, 0.0, 0.1, force, True)
@@ -159,7 +163,7 @@ def test_the_system_measures_from_the_tips_side_to_the_objects():
         (speed,), _ = system_outputs(state_at(gap))
         assert speed == pytest.approx(allowed_speed(C, first_state(C), gap))
     (speed,), (mean, std) = system_outputs(state_at(0.003), force=[0.0, -3.0, 0.0])
-    assert 0.002 < mean < 0.003 and std < C.std_first
+    assert 0.002 < mean < 0.003 and std < C.place.std_first
 
 
 def test_bad_input_leaves_all_as_it_is():
@@ -169,8 +173,8 @@ def test_bad_input_leaves_all_as_it_is():
     ):
         settings = dict(x=state_at(0.002), force=[3.0, 0.0, 0.0]) | change
         (speed,), belief = system_outputs(**settings)
-        assert speed == C.first
-        np.testing.assert_array_equal(belief, [0.0, C.std_first])
+        assert speed == C.speed.first
+        np.testing.assert_array_equal(belief, [0.0, C.place.std_first])
     # Of what is not seen nothing is learned.
     for valid, learned in ((0.0, False), (1.0, True)):
         _, belief = system_outputs(state_at(0.002), valid=valid, force=[3.0, 0.0, 0.0])
@@ -180,10 +184,10 @@ def test_bad_input_leaves_all_as_it_is():
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (dict(force_desired=0.0), "touch.force_desired is 0.0, expected > 0"),
-        (dict(first=0.2), "touch.first is 0.2, expected between"),
-        (dict(growth=0.5), "touch.growth is 0.5, expected at least 1"),
-        (dict(std_first=np.nan), "touch.std_first is nan"),
+        ({"force_desired": 0.0}, "touch.force_desired is 0.0, expected > 0"),
+        ({"speed": TouchSpeedConfig(first=0.2)}, "speed.first is 0.2, expected betw"),
+        ({"speed": TouchSpeedConfig(growth=0.5)}, "speed.growth is 0.5, expected at"),
+        ({"place": TouchPlaceConfig(std_first=np.nan)}, "touch.place.std_first is nan"),
     ],
 )
 def test_a_setting_out_of_range_is_named(change, says):

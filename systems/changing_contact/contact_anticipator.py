@@ -84,6 +84,17 @@ class ContactFilterConfig:
 
 
 @dataclass
+class KnownReflexConfig:
+    """The arm's impact reflex, on which the force of an impact depends. The diagram
+    takes it from its setting `reflex`, where it has one."""
+
+    gain: float = 0.0  # 0: no reflex.
+    force_least: float = 0.0  # Least force of the reflex [N].
+    # The same for contacts that were felt before [N]; 0: the same.
+    force_known: float = 0.0
+
+
+@dataclass
 class ApproachSpeedConfig:
     """How fast a contact is approached, and how that is learned from impacts."""
 
@@ -98,15 +109,7 @@ class ApproachSpeedConfig:
     stiffness_most: float = 0.0
     # Peak force of the first impact on a contact of stiffness_most [N].
     force_first: float = 8.0
-    # Gain of the arm's impact reflex, on which the force of an impact depends; 0: no
-    # reflex. Taken from reflex.gain where there is that setting.
-    reflex_gain: float = 0.0
-    # Least force of the arm's impact reflex [N]. Taken from reflex.force_least where
-    # there is that setting.
-    reflex_force_least: float = 0.0
-    # The same for contacts that were felt before [N]; 0: the same. Taken from
-    # reflex.force_known where there is that setting.
-    reflex_force_known: float = 0.0
+    reflex: KnownReflexConfig = field(default_factory=KnownReflexConfig)
     # Whether the next approach speed follows from a regression F = s v over all
     # impacts; false: from eq. 9.
     regression: bool = True
@@ -163,12 +166,7 @@ class AnticipatorMemory:
         return self  # Every part is immutable, so a Context may share it.
 
 
-MAY_BE_ZERO = (
-    "stiffness_most",
-    "reflex_gain",
-    "reflex_force_least",
-    "reflex_force_known",
-)
+MAY_BE_ZERO = ("stiffness_most", *vars(KnownReflexConfig()))
 
 
 def reduced_mass_one(p, d) -> float:
@@ -182,7 +180,7 @@ def first_speed(config: ApproachSpeedConfig, p, d, effective_mass) -> float:
     if config.stiffness_most > 0.0:
         mass = effective_mass(p, d)
         force = unbraked_force(
-            config.force_first, config.reflex_gain, config.reflex_force_least
+            config.force_first, config.reflex.gain, config.reflex.force_least
         )
         speed = impact_speed(force, config.stiffness_most, mass)
     return float(min(speed, config.most))
@@ -240,7 +238,8 @@ class KalmanContactAnticipator(LeafSystem):
         super().__init__()
         check_settings(config)
         self._filter, self._speed = replace(config.filter), replace(config.speed)
-        numbers = {**vars(config.filter), **vars(config.speed)}
+        speed = dict(vars(config.speed))
+        numbers = {**vars(config.filter), **vars(speed.pop("reflex")), **speed}
         for name, value in numbers.items():
             if isinstance(value, bool):
                 continue
@@ -508,9 +507,9 @@ class KalmanContactAnticipator(LeafSystem):
             speed = speed_by_regression(
                 impacts,
                 s.force_desired,
-                s.reflex_gain,
-                s.reflex_force_least,
-                s.reflex_force_known or None,
+                s.reflex.gain,
+                s.reflex.force_least,
+                s.reflex.force_known or None,
                 s.force_drift,
             )
         else:
@@ -522,11 +521,11 @@ class KalmanContactAnticipator(LeafSystem):
         s, source = self._speed, belief.contacts[k]
         speed, force = source.impacts[-1]
         mass = self._mass(source.mean, source.direction)
-        least = s.reflex_force_least
-        known = (s.reflex_force_known or least) if len(source.impacts) > 1 else least
-        force = unbraked_force(force, s.reflex_gain, known)
+        reflex, least = s.reflex, s.reflex.force_least
+        known = (reflex.force_known or least) if len(source.impacts) > 1 else least
+        force = unbraked_force(force, reflex.gain, known)
         stiffness = contact_stiffness(speed, force, mass)
-        wanted = unbraked_force(s.force_desired, s.reflex_gain, least)
+        wanted = unbraked_force(s.force_desired, reflex.gain, least)
         for i, contact in enumerate(belief.contacts):
             if contact.kind != IMPACT or len(contact.impacts):
                 continue

@@ -1,5 +1,7 @@
 """How fast a tip may touch an object, as a system: see numerics/touch_down.py."""
 
+from dataclasses import is_dataclass
+
 import numpy as np
 from pydrake.common.value import Value
 from pydrake.systems.framework import LeafSystem
@@ -61,8 +63,8 @@ class TouchDown(LeafSystem):
         self._phase = self.DeclareVectorInputPort("phase", 1)
         self._tip_force = self.DeclareVectorInputPort("tip_force", 3)
         self._touch = self.DeclareAbstractState(Value[object](first_state(config)))
-        self._speed = self.DeclareDiscreteState([config.first])
-        self._belief = self.DeclareDiscreteState([0.0, config.std_first])
+        self._speed = self.DeclareDiscreteState([config.speed.first])
+        self._belief = self.DeclareDiscreteState([0.0, config.place.std_first])
         self.DeclareStateOutputPort("touch_speed", self._speed)
         self.DeclareStateOutputPort("belief", self._belief)
         self.DeclarePeriodicUnrestrictedUpdateEvent(
@@ -101,14 +103,17 @@ class TouchDown(LeafSystem):
 
 
 def _check(config: TouchDownConfig) -> None:
-    for name in vars(config):
-        value = getattr(config, name)
-        if not 0.0 < value < np.inf:
-            raise ValueError(f"touch.{name} is {value}, expected > 0")
-    if not config.least <= config.first <= config.most:
+    speed = config.speed
+    for within, part in (
+        ("touch", config), ("touch.speed", speed), ("touch.place", config.place)
+    ):  # fmt: skip
+        for name, value in vars(part).items():
+            if not is_dataclass(value) and not 0.0 < value < np.inf:
+                raise ValueError(f"{within}.{name} is {value}, expected > 0")
+    if not speed.least <= speed.first <= speed.most:
         raise ValueError(
-            f"touch.first is {config.first}, expected between touch.least "
-            f"{config.least} and touch.most {config.most}"
+            f"touch.speed.first is {speed.first}, expected between touch.speed.least "
+            f"{speed.least} and touch.speed.most {speed.most}"
         )
-    if config.growth < 1.0:
-        raise ValueError(f"touch.growth is {config.growth}, expected at least 1")
+    if speed.growth < 1.0:
+        raise ValueError(f"touch.speed.growth is {speed.growth}, expected at least 1")

@@ -1,6 +1,7 @@
 """The phases of pushing an object as a system (numerics/push_task.py)."""
 
 from dataclasses import dataclass, field
+from operator import attrgetter
 
 import numpy as np
 from pydrake.common.value import Value
@@ -54,18 +55,18 @@ class PushTask(LeafSystem):
     def __init__(self, config: PushTaskConfig, n_knots: int, shape: ObjectShape, p_tip):
         super().__init__()
         check_settings(config)
-        for name in ("speed", "acceleration", "descent", "margin", "look_ahead",
-                     "look_ahead_angle", "unseen_sec", "believed_sec",
-                     "nearest", "farthest", "bearing"):  # fmt: skip
-            if not getattr(config.push, name) > 0.0:
-                raise ValueError(
-                    f"task.push.{name} is {getattr(config.push, name)}, expected > 0"
-                )
-        for name in ("room", "place_change"):
-            if not 0.0 <= getattr(config.push, name) < np.inf:
-                raise ValueError(
-                    f"task.push.{name} is {getattr(config.push, name)}, expected >= 0"
-                )
+        for name in (
+            *(f"travel.{n}" for n in ("speed", "acceleration", "descent", "margin")),
+            *(f"reach.{n}" for n in ("nearest", "farthest", "bearing")),
+            *("unseen.sec", "unseen.believed_sec", "look_ahead", "look_ahead_angle"),
+        ):
+            value = attrgetter(name)(config.push)
+            if not value > 0.0:
+                raise ValueError(f"task.push.{name} is {value}, expected > 0")
+        for name in ("travel.room", "place_change"):
+            value = attrgetter(name)(config.push)
+            if not 0.0 <= value < np.inf:
+                raise ValueError(f"task.push.{name} is {value}, expected >= 0")
         for name in ("height", "clearance", "period_sec"):
             if not getattr(config, name) > 0.0:
                 raise ValueError(

@@ -14,7 +14,7 @@ There a trial is a motion along one line that is repeated; here it is any touch 
 side, so that what is learned is a distance, not a place.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -33,38 +33,47 @@ GATE = 4.0
 
 
 @dataclass
-class TouchDownConfig:
-    """How fast a tip comes down, and what it learns from each touch."""
+class TouchSpeedConfig:
+    """Speeds before a touch, and how the one in the region of anticipated contact is
+    learned."""
 
-    # Desired peak force of a touch, as the arm feels it [N].
-    force_desired: float = 8.0
-    # Speed in the region of anticipated contact before any touch was felt [m/s].
-    first: float = 0.05
+    first: float = 0.05  # Speed in the region before any touch was felt [m/s].
+    least: float = 0.01  # Least speed in the region [m/s].
+    # Largest speed of a tip that has not touched, in the region and before it [m/s].
+    most: float = 0.15
     # Largest factor of the speed in the region from one touch to the next.
     growth: float = 1.4
     # Standard deviation, in proportion, by which the force of a touch at one speed
     # changes from one touch to the next; sides and places differ.
     force_drift: float = 0.1
-    least: float = 0.01  # Least speed in the region of anticipated contact [m/s].
-    # Largest speed of a tip that has not touched, in the region and before it [m/s].
-    most: float = 0.15
+    # Length before the region over which the speed falls to that in the region [m].
+    brake: float = 0.01
+
+
+@dataclass
+class TouchPlaceConfig:
+    """The region of anticipated contact: the distance between tip and side at which a
+    touch is felt."""
+
+    std_first: float = 0.004  # Standard deviation before any touch [m].
+    std_measured: float = 0.0015  # Standard deviation of one measurement [m].
+    std_drift: float = 0.001  # Standard deviation of the change between touches [m].
+    sigmas: float = 2.0  # Half width of the region, in standard deviations.
+
+
+@dataclass
+class TouchDownConfig:
+    """How fast a tip comes down, and what it learns from each touch."""
+
+    # Desired peak force of a touch, as the arm feels it [N].
+    force_desired: float = 8.0
+    speed: TouchSpeedConfig = field(default_factory=TouchSpeedConfig)
+    place: TouchPlaceConfig = field(default_factory=TouchPlaceConfig)
     touch_force: float = 1.0  # Force from which on a touch is felt [N].
     # Time after the touch within which its peak force comes [s].
     peak_sec: float = 0.08
     # Time without a felt force after which the next touch counts as another one [s].
     apart_sec: float = 0.05
-    # Standard deviation of the distance at which a touch is felt, before any touch [m].
-    std_first: float = 0.004
-    # Standard deviation of one measurement of the distance at which a touch is felt
-    # [m].
-    std_measured: float = 0.0015
-    # Standard deviation of the change from touch to touch of the distance at which a
-    # touch is felt [m].
-    std_drift: float = 0.001
-    # Half width of the region of anticipated contact, in standard deviations.
-    sigmas: float = 2.0
-    # Length before the region over which the speed falls to that in the region [m].
-    brake: float = 0.01
 
 
 @dataclass(frozen=True)
@@ -86,7 +95,7 @@ class TouchDownState:
 
 
 def first_state(config: TouchDownConfig) -> TouchDownState:
-    return TouchDownState(config.first, variance=config.std_first**2)
+    return TouchDownState(config.speed.first, variance=config.place.std_first**2)
 
 
 def next_touch(
@@ -104,25 +113,26 @@ def next_touch(
         [m/s]; force on it [N]; pushing: whether it is to touch; else what it feels is
         its own acceleration.
     """
-    c, s = config, state
+    c, s, place = config, state, config.place
     s = replace(s, since_sec=s.since_sec + dt)
     if s.since_sec <= c.peak_sec:
         s = replace(s, peak=max(s.peak, force))
     elif s.peak > 0.0:  # The touch is over: v_a of the next one.
-        slow = s.at < 0.5 * c.least  # It leaned on it; that was no impact.
+        slow = s.at < 0.5 * c.speed.least  # It leaned on it; that was no impact.
         impacts = s.impacts if slow else (*s.impacts, (s.at, s.peak))[-KEPT:]
-        wanted = speed_by_regression(impacts, c.force_desired, drift=c.force_drift)
+        drift, bounds = c.speed.force_drift, (c.speed.least, c.speed.most)
+        wanted = speed_by_regression(impacts, c.force_desired, drift=drift)
         if wanted is not None:
-            wanted = capped(wanted, s.speed, c.growth, c.least, c.most)
+            wanted = capped(wanted, s.speed, c.speed.growth, *bounds)
             s = replace(s, speed=wanted)
         s = replace(s, impacts=impacts, peak=0.0)
     felt = force >= c.touch_force
     if felt and pushing and s.apart_sec >= c.apart_sec:
-        predicted = s.variance + c.std_drift**2
-        spread = np.sqrt(predicted + c.std_measured**2)
+        predicted = s.variance + place.std_drift**2
+        spread = np.sqrt(predicted + place.std_measured**2)
         gain = predicted / spread**2
         if abs(distance - s.mean) > GATE * spread:
-            s = replace(s, variance=min(2.0 * predicted, c.std_first**2))
+            s = replace(s, variance=min(2.0 * predicted, place.std_first**2))
         else:
             s = replace(
                 s,
@@ -139,7 +149,7 @@ def next_touch(
 
 def allowed_speed(config: TouchDownConfig, state: TouchDownState, distance) -> float:
     """[m/s] of a tip at a distance [m] from the side that has not touched it yet."""
-    c, s = config, state
-    half = c.sigmas * np.sqrt(s.variance + c.std_drift**2 + c.std_measured**2)
-    ahead = distance - s.mean - half
+    c, place, s = config.speed, config.place, state
+    variance = s.variance + place.std_drift**2 + place.std_measured**2
+    ahead = distance - s.mean - place.sigmas * np.sqrt(variance)
     return float(s.speed + (c.most - s.speed) * unit_step(ahead / c.brake)[0])

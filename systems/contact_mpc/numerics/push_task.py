@@ -44,11 +44,11 @@ TAKEN_BACK = 0.001
 
 
 @dataclass
-class PushConfig:
-    """How a tip goes about an object and pushes it."""
+class TravelConfig:
+    """How the tip goes to another place beside the object."""
 
-    speed: float = 0.35  # Largest speed of the tip as it travels [m/s].
-    acceleration: float = 2.0  # Largest acceleration of the tip as it travels [m/s2].
+    speed: float = 0.35  # Largest speed of the tip [m/s].
+    acceleration: float = 2.0  # Largest acceleration of the tip [m/s2].
     # Largest speed of the tip as it comes down beside the object [m/s].
     descent: float = 0.08
     # Distance beyond its place, away from the object, at which the tip comes down where
@@ -57,33 +57,48 @@ class PushConfig:
     room: float = 0.008
     # Clearance of the tip over the object where it passes above it [m].
     margin: float = 0.012
+    # Whether a low tip goes around the object, not over it; for an object of one convex
+    # part.
+    around: bool = False
+
+
+@dataclass
+class FollowedConfig:
+    """Where an object is followed, seen from the arm's base."""
+
+    nearest: float = 0.25  # Least distance [m].
+    farthest: float = 0.75  # Largest distance [m].
+    bearing: float = 1.05  # Largest angle from the x axis, to either side [rad].
+
+
+@dataclass
+class UnseenConfig:
+    """What the tip does while the object is not seen."""
+
+    sec: float = 0.3  # Time for which it goes on pushing, before it waits [s].
+    # Time for which it goes on travelling, before it waits: the arm may hide the object
+    # on its way [s].
+    believed_sec: float = 3.0
+    # Place where the tip waits and hides nothing from the camera, [x, y] [m].
+    withdrawn: list[float] = field(default_factory=lambda: [0.3, 0.0])
+
+
+@dataclass
+class PushConfig:
+    """How a tip goes about an object and pushes it."""
+
+    travel: TravelConfig = field(default_factory=TravelConfig)
+    reach: FollowedConfig = field(default_factory=FollowedConfig)
+    unseen: UnseenConfig = field(default_factory=UnseenConfig)
     look_ahead: float = 0.06  # Largest distance of C3's target from the object [m].
     # Largest turn of C3's target from the object's yaw [rad].
     look_ahead_angle: float = 0.5
-    # Time for which the tip goes on pushing an object that is not seen, before it waits
-    # [s].
-    unseen_sec: float = 0.3
-    # Time for which the tip goes on travelling while the object is not seen, before it
-    # waits: the arm may hide the object on its way [s].
-    believed_sec: float = 3.0
-    # Least distance from the arm's base at which an object is followed [m].
-    nearest: float = 0.25
-    # Largest distance from the arm's base at which an object is followed [m].
-    farthest: float = 0.75
-    # Largest angle from the x axis at which an object is followed, to either side
-    # [rad].
-    bearing: float = 1.05
-    # Place where the tip waits and hides nothing from the camera, [x, y] [m].
-    withdrawn: list[float] = field(default_factory=lambda: [0.3, 0.0])
     # Whether the tip travels along with an object that rolls on by itself, and arrives
     # with its velocity; always so for a cylinder.
     follow: bool = False
     # Distance between the place that the tip travels to and the one measured on the
     # object above which the latter replaces it: less is noise [m].
     place_change: float = 0.008
-    # Whether a low tip goes around the object, not over it; for an object of one convex
-    # part.
-    around: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,9 +173,10 @@ def next_push(
     """
     unseen = 0.0 if seen else state.unseen_sec + dt
     state = replace(state, unseen_sec=unseen)
-    travels = state.phase == TRAVEL
-    lost = unseen > (config.believed_sec if travels else config.unseen_sec)
-    followed = [config.nearest, config.farthest], config.bearing
+    travels, patience = state.phase == TRAVEL, config.unseen
+    lost = unseen > (patience.believed_sec if travels else patience.sec)
+    reach = config.reach
+    followed = [reach.nearest, reach.farthest], reach.bearing
     lost = lost or not in_reach(x[P_BALL][None, :2], *followed)[0]
     # C3 knows no object that is not seen; nor does anybody know a place before that.
     if lost or place is None:
@@ -175,8 +191,9 @@ def next_push(
     if state.phase == CONTACT:
         return state
     outline = outline_of(shape.parts, rotation_of(x[Q_BALL]), x[P_BALL])
-    limits = config.speed, config.acceleration
-    up = shape.clear_height(config.margin)
+    travel = config.travel
+    limits = travel.speed, travel.acceleration
+    up = shape.clear_height(travel.margin)
     distance = shape.tip_radius + 0.5 * clearance + nearer
     along = np.zeros(3)
     if config.follow and state.phase == TRAVEL:
@@ -186,12 +203,12 @@ def next_push(
         """Beside an object that moves, the way is the one beside it at rest."""
         p, v, a, arrived = travel_step(
             state.p, state.v - along, goal, outline, distance, up, limits, dt, descent,
-            config.around,
+            travel.around,
         )  # fmt: skip
         return p + dt * along, v + along, a, arrived
 
     if state.phase == WAIT:
-        p, v, a, _ = step(np.array([*config.withdrawn, up]))
+        p, v, a, _ = step(np.array([*patience.withdrawn, up]))
         return replace(state, p=p, v=v, a=a)
     if state.lifting:
         p, v, a, arrived = step(np.array([*state.p[:2], up]))
@@ -210,12 +227,12 @@ def next_push(
     goal = np.array([*held, height])
     # Below the object's top it meets a side, not an edge.
     if state.p[2] > max(height + LOW, EDGE * shape.top):
-        beside = held - config.room * inward(held[None], outline)[0]
+        beside = held - travel.room * inward(held[None], outline)[0]
         near = distance_to_outline(beside[None], outline)[0]
-        if near > shape.tip_radius + clearance + 0.5 * config.room:
+        if near > shape.tip_radius + clearance + 0.5 * travel.room:
             goal[:2] = beside
     # An object that is larger than believed is higher, too.
-    descent = config.descent, shape.clear_height(0.5 * config.margin)
+    descent = travel.descent, shape.clear_height(0.5 * travel.margin)
     p, v, a, arrived = step(goal, descent)
     state = replace(state, p=p, v=v, a=a, place=held, go=go)
     # What is in its way down is noticed on the way, or the tip presses on it all along.
