@@ -13,8 +13,8 @@ def test_what_was_missed_comes_first_and_text_is_no_html():
     says = ["met     rests: yes", "MISSED  error: 3 < 2"]
     page = result_page("makebreak run spring_mass", [table], False, says)
     assert "Goals missed" in page and "<iframe" not in page
-    assert '<li class="error">MISSED  error: 3 &lt; 2</li>' in page
-    assert "<li>met     rests: yes</li>" in page
+    assert '<li class="error"><b>MISSED</b>: error: 3 &lt; 2</li>' in page
+    assert "<li><b>met</b>: rests: yes</li>" in page
     assert '<td class="error">MISSED</td>' in page
     cells = re.findall(r"<td.*?>(.*?)</td>", page)
     assert cells == ["&lt;b&gt;x&lt;/b&gt;", "-", "", "y", "0.25", "MISSED"]
@@ -48,7 +48,7 @@ def test_a_reproduction_says_which_targets_are_missed():
     none = Table("Others", heads, rows)
     page = result_page("t", *_of_targets([both, none]))
     assert "Goals missed" in page and "Walls: 1 of 2 targets met" in page
-    assert '<li class="error">MISSED force: paper 8 N, ours 9 N</li>' in page
+    assert '<li class="error"><b>MISSED</b>: force: paper 8 N, ours 9 N</li>' in page
     assert "Goals" not in result_page("t", *_of_targets([none]))
     met = Table("Walls", heads, rows, [True, True])
     assert "Goals met" in result_page("t", *_of_targets([met]))

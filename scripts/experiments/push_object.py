@@ -229,10 +229,12 @@ def score(config, diagram, log, truth, goals):
         "joint_range": float((abs(truth.q - middle) / half).max()),
     }
     worst = float(np.max(list(shares.values())))  # NaN, if one is.
-    criteria.at_most("limits", "of the arm's limits, used", worst, 1.0 + 1e-6)
+    criteria.at_most("limits", "arm's limits, largest fraction used", worst, 1.0 + 1e-6)
     # A simulated joint cannot pass its stop, so the limit is a little below 1.
     stop = shares["joint_range"]
-    criteria.at_most("stops", "of half a joint's range, used", stop, STOP_MAX)
+    criteria.at_most(
+        "stops", "half of a joint's range, largest fraction used", stop, STOP_MAX
+    )
     r = log["r"][-1, :N_TIP].mean() * LEARN if "r" in log and len(log.time) else 0.0
     return criteria.result() | {
         "n_goals": n,

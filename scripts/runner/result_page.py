@@ -28,10 +28,7 @@ def result_page(
     """
     colour = {True: _GOOD, False: _BAD, None: _NEUTRAL}[success]
     badge = {True: "Goals met", False: "Goals missed", None: "Results"}[success]
-    missed = {True: ' class="error"', False: ""}
-    lines = "".join(
-        f"<li{missed[line.startswith('MISSED')]}>{escape(line)}</li>" for line in says
-    )
+    lines = "".join(map(_said, says))
     moving = ""
     if is_moving:
         moving = '<iframe src="meshcat.html#small" title="The run"></iframe>'
@@ -54,6 +51,15 @@ def result_page(
         f"<title>{escape(title)} - makebreak</title><style>{STYLE}</style></head>\n"
         f"<body><main>{''.join(body)}</main></body></html>\n"
     )
+
+
+def _said(line: str) -> str:
+    """A line of the first screen: a criterion, after its verdict, or any other text."""
+    verdict, _, criterion = line.partition(" ")
+    if verdict not in ("met", "MISSED"):
+        return f"<li>{escape(line)}</li>"
+    missed = ' class="error"' if verdict == "MISSED" else ""
+    return f"<li{missed}><b>{verdict}</b>: {escape(criterion.strip())}</li>"
 
 
 def _cell(text: str) -> str:
