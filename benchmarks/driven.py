@@ -57,10 +57,11 @@ class Search:
         self._rig, self._log = rig, log
         by, effort = scales(rig, log)
         n, given = len(effort), rig.values
+        most = 2.0 * effort  # A joint that moves a quarter of the time has no more.
         none, inertia = np.zeros(n), rig.inertia(log.q.mean(axis=0))
         low = Values(none, none, none, none - MOST_OFFSET, 0.2 * given.kp, np.zeros(1))
         high = Values(
-            effort, effort / by["damping"], given.rotor + 2.0 * inertia,
+            most, most / by["damping"], given.rotor + 2.0 * inertia,
             none + MOST_OFFSET, 1.8 * given.kp, np.array([MOST_DELAY_SEC]),
         )  # fmt: skip
         sizes = [len(getattr(given, f.name)) for f in fields(Values)]
