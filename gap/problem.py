@@ -89,7 +89,8 @@ class Candidate:
     @property
     def name(self) -> str:
         if self.members:
-            return f"{self.kind} at {len(self.members)} places"
+            kinds = ", ".join(dict.fromkeys(m.kind for m in self.members))
+            return f"{kinds} at {len(self.members)} places"
         return f"{self.kind} at {', '.join(self.at)}"
 
     def effects(self, alternative: int, c: np.ndarray) -> tuple[Effect, ...]:

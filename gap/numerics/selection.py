@@ -15,6 +15,7 @@ from scipy.stats import chi2, norm, wilcoxon
 from scipy.stats import t as student_t
 
 from makebreak.gap.numerics.runs import starts_of_runs
+from makebreak.gap.thresholds import FREE_TOLERANCE
 
 # Blocks that tell a parameter, of which a scatter is taken (one draw in 400 has none of
 # six), or this share of few: those that say more than others count as fewer.
@@ -111,6 +112,34 @@ class Screen:
         spread = np.sqrt(self._s2 * np.maximum(np.diag(inverse), 0.0))
         left = self.r - columns @ (c / size) - self._N @ b
         return self._fit(c / size, spread / size, b, left)
+
+    def beside(self, columns) -> "Screen":
+        """The same, with further columns (m, k) that are practically free."""
+        r, nuisance, prior, *rest = self._given
+        prior = np.append(prior, np.full(columns.shape[1], FREE_TOLERANCE))
+        return Screen(r, np.hstack([nuisance, columns]), prior, *rest)
+
+    def without_each(self, columns, of) -> np.ndarray:
+        """(n, m) what columns (m, k) leave but for those of one of n things, all others
+        and the nuisances free; nuisances that are at their limits with all of them
+        stay. of (k,): the thing that each column is of."""
+        t, fit, k = self._train, self.fit(columns), columns.shape[1]
+        free = np.abs(fit.b) < self._limit * (1.0 - 1e-9)
+        Z = np.hstack([columns, self._N[:, free]])
+        prior = np.append(np.full(k, np.inf), self._prior[free])
+        known = self._s2 / prior**2
+        size = np.sqrt(np.sum(Z[t] ** 2, axis=0) + known)
+        size[size <= 1e-9 * size[:k].max(initial=0.0)] = np.inf  # As in fit.
+        Z = Z / size
+        P = _pseudo_inverse(Z[t].T @ Z[t] + np.diag(known / size**2))
+        c = np.where(np.isfinite(size[:k]), fit.c * size[:k], 0.0)
+        left = self.r - columns @ fit.c - self._N @ fit.b
+        found = []
+        for number in range(int(of.max(initial=-1)) + 1):
+            mine = np.flatnonzero(of == number)
+            back = np.linalg.lstsq(P[np.ix_(mine, mine)], c[mine], rcond=1e-10)[0]
+            found.append(left + Z @ (P[:, mine] @ back))
+        return np.array(found)
 
     def evaluate(self, r, c=(), c_std=()) -> LinearFit:
         """For another residual (m,): with the nuisances that its training rows want."""

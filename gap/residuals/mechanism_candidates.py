@@ -30,6 +30,7 @@ _DELAYS = (0.004, 0.01, 0.02, 0.04)  # [s] at which a delay's column is taken.
 # Relative or absolute steps of other parameters of sensors.
 _STEPS = {"offset": (1e-3,), "bias": (1e-3,), "skew": (1e-4,)}
 _VELOCITY_DELAYS = (0.01,)
+LESS_GAIN = 0.2  # Share of a drive's gain by which its column is taken.
 _WAVES = 12  # Frequencies of a force that are tried on links other than the last.
 ALL_OF_IT = 1e-6  # Of equations that masses alone make: so much is rounding.
 LOAD = 0.1  # First trial of a load, of what a link weighs on average.
@@ -340,18 +341,20 @@ def _of_delays(model: InverseModel, kind: str) -> list[Candidate]:
 
 
 def _of_drives(model: InverseModel, kind: str) -> list[Candidate]:
-    """Of drives' own numbers: by the difference that one more or less makes."""
+    """Of drives' own numbers: by the difference that one less makes. Equations are in
+    units of what drives are told, so they are linear in the reciprocal of a gain."""
     found = []
     for at in model.dynamics.places(kind):
         if not _driven(model, at):
             continue
         ((name, now),) = model.dynamics.now(kind, [at]).items()
-        step = 0.2 * now
+        step = LESS_GAIN * now
         moved = model.residual([Effect(kind, [at], {name: now - step})])
         columns = ((moved - model.base()) / step)[:, None]
 
         def read(c, name=name, now=now):
-            return {name: now + float(c[0])}
+            share = 1.0 - float(c[0]) / now / (1.0 - LESS_GAIN)
+            return {name: now / share if share > 0.0 else np.inf}
 
         found.append(Candidate(kind, (at,), 1, (columns,), (read,)))
     return found

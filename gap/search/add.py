@@ -15,7 +15,11 @@ from makebreak.gap.search.choice import (
     why_not,
 )
 from makebreak.gap.search.comparison import Comparison
-from makebreak.gap.search.groups import groups_of, with_pruned_groups
+from makebreak.gap.search.groups import (
+    groups_of,
+    of_more_kinds,
+    with_pruned_groups,
+)
 from makebreak.gap.search.pairs import look_ahead, pair_instead
 from makebreak.gap.search.rivals import Rivals
 from makebreak.gap.search.screen import Ranked, rank
@@ -91,8 +95,10 @@ def add_next(
     # Where two effects nearly cancel a third may be needed beside each of them alone.
     both = rivals.both_needed(trials, (first, pick), chosen)
     pair = _pair(search, both, (wide, screen), chosen, ranked, trials, pick)
-    if pair is not None:
-        trials.append(pair)
+    instead = [each for each in (pair, _wider(search, (wide, screen), chosen, free,
+                                              trials[pick])) if each]  # fmt: skip
+    if instead:
+        trials.append(instead[-1])
         pick = len(trials) - 1
     before = screen.fit_nuisances(current.r)[1]
     strained = search.is_strained(current)
@@ -178,6 +184,25 @@ def _pair(
     if pair is None:
         pair = look_ahead(search, screen, chosen, trials, pick)
     return pair
+
+
+def _wider(
+    search: Comparison, screens: tuple[Screen, Screen], chosen: Sequence[Choice],
+    free: Sequence[Candidate], pick: Trial,
+) -> Trial | None:  # fmt: skip
+    """What many joints have, with all else that joints may have, where that leaves
+    clearly less."""
+    wide, screen = screens
+    group = pick.ranked.candidate
+    if group.kind not in KINDS or not group.members:
+        return None
+    if not search.needs_more(pick.fit):
+        return None
+    found = of_more_kinds(search, wide, free, group)
+    for trial in fit_each(search, screen, chosen, [found] if found else []):
+        if search.error(trial.fit.score) < search.enough(pick.fit.score):
+            return trial
+    return None
 
 
 def _choices(

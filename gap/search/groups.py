@@ -1,7 +1,9 @@
 """Groups: one kind at all joints, or channels, as one candidate.
 
 "All seven joints have friction" may take off most of the gap where no joint by itself
-takes off enough. The members are fitted together, and each must earn its place.
+takes off enough. The members are fitted together, and each must earn its place. Where
+friction, a drive's gain and a rotor are off together, each alone explains so much that
+the first ones to be added stand for the others: fitted at once each takes its own.
 """
 
 from collections.abc import Sequence
@@ -9,10 +11,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from makebreak.gap.numerics.selection import LinearFit, Screen
+from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Candidate, rms
 from makebreak.gap.search.comparison import Comparison
-from makebreak.gap.search.screen import Ranked
+from makebreak.gap.search.screen import Ranked, rank
 from makebreak.gap.thresholds import (
     CHANNEL_GAIN,
     MEMBER_GAIN,
@@ -20,8 +22,11 @@ from makebreak.gap.thresholds import (
     MEMBERS_MIN,
 )
 from makebreak.models.effects import KINDS
+from makebreak.models.effects.kind import Effect
 
 _PLACES = ("joint", "actuator", "channel", "drive")
+# Units of what a joint may have beside what all joints have.
+_FORCES = ("N m", "N m s/rad", "N m/rad", "kg m2")
 
 
 def groups_of(found: Sequence[Candidate]) -> list[Candidate]:
@@ -40,6 +45,40 @@ def groups_of(found: Sequence[Candidate]) -> list[Candidate]:
         for kind, members in by_kind.items()
         if len(members) >= MEMBERS_MIN
     ]  # fmt: skip
+
+
+def of_more_kinds(
+    search: Comparison, screen: Screen, free: Sequence[Candidate], group: Candidate
+) -> Ranked | None:
+    """A group with all other groups of forces at joints, and what else earns its place
+    beside these, less the members that do not; None where that is the same group."""
+    members = [
+        *group.members,
+        *(m for other in groups_of(free) if other.kind != group.kind
+          and KINDS[other.kind].parameters[0].unit in _FORCES for m in other.members),
+    ]  # fmt: skip
+    there = {id(m) for m in members}
+    others = [c for c in free if not c.members and id(c) not in there]
+    wide = screen.beside(np.hstack([m.columns[0] for m in members]))
+    score = search.error(wide.evaluate(wide.r).score)
+    while True:
+        best = next((x for x in rank(wide, others) if x.valid), None)
+        if best is None:
+            break
+        less = search.error(best.fit.score)
+        if not less < (1.0 - search.plan.least_gain) * score:
+            break
+        of, k = best.candidate, best.alternative
+        members.append(
+            replace(of, columns=(best.columns,), to_parameters=(of.to_parameters[k],))
+        )
+        others = [c for c in others if c is not of]
+        wide, score = wide.beside(best.columns), less
+    whole = replace(group, members=tuple(members))
+    wider = _pruned(search, screen, Ranked(whole, screen.fit(), (), True, 0))
+    if wider is None or {m.kind for m in wider.candidate.members} == {group.kind}:
+        return None
+    return wider
 
 
 def with_pruned_groups(
@@ -65,52 +104,65 @@ def _pruned(search: Comparison, screen: Screen, group: Ranked) -> Ranked | None:
         members = members[:k] + members[k + 1 :]
     if len(members) < MEMBERS_MIN:
         return None
-    X, fit, _ = _fit(screen, members)
+    X, of = _columns_of(members)
+    fit = screen.fit(X)
     candidate = replace(
         group.candidate,
         at=tuple(at for m in members for at in m.at),
-        size=len(members),
+        size=sum(m.size for m in members),
         columns=(X,),
         members=tuple(members),
     )
-    found = candidate.effects(0, fit.c)
+    found = _beside_gains(search, candidate.effects(0, fit.c))
     return Ranked(candidate, fit, found, True, 0) if candidate.is_sane(found) else None
+
+
+def _beside_gains(search: Comparison, effects: Sequence[Effect]) -> tuple[Effect, ...]:
+    """Effects as columns of equations have them, which are in units of what a drive is
+    told: with more of a gain at their joint they are as much larger."""
+    more: dict[str, float] = {}
+    for e in effects if search.problem.by_equations else ():
+        if KINDS[e.kind].path == "kp":
+            ((name, kp),) = e.parameters.items()
+            more[e.at[0]] = kp / search.problem.dynamics.now(e.kind, e.at)[name]
+    out = []
+    for e in effects:
+        entry, times = KINDS[e.kind], more.get(e.at[0], 1.0)
+        if entry.path != "kp" and entry.parameters[0].unit in _FORCES:
+            p = {name: times * x for name, x in e.parameters.items()}
+            e = Effect(e.kind, e.at, p)
+        out.append(e)
+    return tuple(out)
 
 
 def _needless_member(
     search: Comparison, screen: Screen, members: Sequence[Candidate]
 ) -> int | None:
-    """The first member that must go: one whose value is impossible, else, from the
-    least significant one on, one without which no channel is much worse. None: all
-    stay."""
+    """The first member that must go, from that on which leaves least without it: one
+    whose value is impossible, else one without which no channel is much worse. None:
+    all stay."""
     held = ~search.train
-    _, fit, r = _fit(screen, members)
-    left = screen.fit_nuisances(r)[1]
+    X, of = _columns_of(members)
+    fit, without = screen.fit(X), screen.without_each(X, of)
+    left = screen.fit_nuisances(screen.r - X @ fit.c)[1]
     z = np.abs(fit.c) / np.maximum(fit.c_std, 1e-300)
-    for k, m in enumerate(members):
-        if not m.is_sane([m.effects(0, fit.c[[k]])[0]]):
+    own = [m.effects(0, fit.c[of == k]) for k, m in enumerate(members)]
+    order = np.argsort([rms(each[held]) for each in without]).tolist()
+    for k in order:
+        if not members[k].is_sane(own[k]):
             return k
-    for k in np.argsort(z).tolist():
-        rest = [*members[:k], *members[k + 1 :]]
-        without = screen.fit_nuisances(_fit(screen, rest)[2])[1]
-        gains = [
-            1.0 - rms(left[mine]) / max(rms(without[mine]), 1e-12)
-            for c in np.unique(search.channel)
-            if (mine := held & (search.channel == c)).any()
-        ]
-        own = members[k].effects(0, fit.c[[k]])[0]
-        clear = z[k] >= MEMBER_Z and not search.problem.is_within_tolerance(own)
-        least = MEMBER_GAIN if clear else CHANNEL_GAIN
-        if max(gains, default=0.0) < least:
+    rows = [held & (search.channel == c) for c in np.unique(search.channel[held])]
+    for k in order:
+        gains = [1.0 - rms(left[x]) / max(rms(without[k][x]), 1e-12) for x in rows]
+        clear = z[of == k].max() >= MEMBER_Z
+        clear = clear and not search.problem.is_within_tolerance(own[k][0])
+        if max(gains, default=0.0) < (MEMBER_GAIN if clear else CHANNEL_GAIN):
             return k
     return None
 
 
-def _fit(
-    screen: Screen, members: Sequence[Candidate]
-) -> tuple[np.ndarray, LinearFit, np.ndarray]:
-    """(m, k) columns of all members, their fit, and the residual (m,) that it leaves
-    before nuisances."""
-    X = np.hstack([m.columns[0] for m in members])
-    fit = screen.fit(X)
-    return X, fit, screen.r - X @ fit.c
+def _columns_of(members: Sequence[Candidate]) -> tuple[np.ndarray, np.ndarray]:
+    """(m, k) columns of all members, and the number (k,) of the member of each."""
+    each = [m.columns[0] for m in members]
+    sizes = [x.shape[1] for x in each]
+    return np.hstack(each), np.repeat(np.arange(len(each)), sizes)

@@ -27,7 +27,8 @@ def merge(
     parameters and does better.
 
     (A load is at first a heavier link, and then, beside it, a link whose centre of mass
-    is elsewhere; their moments of inertia are not those of the load.)
+    is elsewhere; their moments of inertia are not those of the load.) What groups have
+    has earned its place beside all others there.
     """
     chosen = list(chosen)
     while search.needs_more(current):
@@ -53,7 +54,7 @@ def _best(
     """(i, j, fit) of the first replacement of effects i and j that does better."""
     pairs = [
         (i, j) for (i, a), (j, b) in combinations(enumerate(chosen), 2)
-        if a.effect.at == b.effect.at
+        if a.effect.at == b.effect.at and not (a.in_group and b.in_group)
     ]  # fmt: skip
     if not pairs:
         return None

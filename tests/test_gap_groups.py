@@ -1,0 +1,111 @@
+"""What joints lack of several kinds, fitted at once and pruned by columns."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from test_gap_sticking import recorded
+
+from makebreak.gap.data.reading import read_recordings
+from makebreak.gap.numerics.selection import Screen
+from makebreak.gap.problem import Candidate
+from makebreak.gap.residuals.mechanism import MechanismProblem
+from makebreak.gap.search.comparison import Comparison
+from makebreak.gap.search.groups import groups_of, of_more_kinds
+from makebreak.models.effects.kind import Effect
+
+
+@pytest.mark.parametrize("reach", [np.inf, 1e3])
+def test_what_is_left_without_each_is_that_of_a_fit_without_it(reach):
+    """Also where one nuisance is known a million times better than another."""
+    rng = np.random.default_rng(0)
+    X = rng.normal(size=(400, 6)) * [1.0, 10.0, 0.1, 1.0, 1.0, 1e-3]
+    N = rng.normal(size=(400, 4)) * [1.0, 1.0, 5.0, 0.1]
+    N[:, 0] += X[:, 0]
+    r = X @ [1.0, 0.1, 3.0, 0.0, 0.2, 100.0] + 0.1 * rng.normal(size=400)
+    train, of = np.arange(400) % 3 != 0, np.array([0, 1, 2, 2, 3, 4])
+    screen = Screen(r, N, np.array([0.1, 0.3, 1e-6, 1.0]), train, 1.5, reach)
+    for k, left in enumerate(screen.without_each(X, of)):
+        some = X[:, of != k]
+        fit = screen.fit(some)
+        np.testing.assert_allclose(left, r - some @ fit.c - N @ fit.b, atol=1e-9)
+
+
+def test_columns_of_a_gain_hold_however_far_it_is_off(tmp_path):
+    """Equations in units of what a drive is told are linear in its reciprocal."""
+    scene, file = recorded(tmp_path, "four", [])
+    scene = replace(scene, actuation=replace(scene.actuation, limit=[]))
+    problem = MechanismProblem(scene, read_recordings([file]))
+    start = Comparison(problem, print).start
+    (found,) = (
+        c for c in problem.candidates(problem.nuisances(), start)
+        if (c.kind, c.at) == ("servo_gain", ("p.wave",))
+    )  # fmt: skip
+    now = problem.dynamics.now("servo_gain", ["p.wave"])["kp"]
+    for times in (0.3, 3.0):
+        effect = Effect("servo_gain", ["p.wave"], {"kp": times * now})
+        off = problem.base() - problem.residual([effect])
+        x = found.columns[0][:, 0]
+        c = float(x @ off / (x @ x))
+        np.testing.assert_allclose(c * x, off, atol=1e-6 * np.abs(off).max())
+        assert found.effects(0, np.array([c]))[0].parameters["kp"] == pytest.approx(
+            times * now
+        )
+
+
+KINDS = ("joint_coulomb_friction", "joint_viscous_damping", "rotor_inertia")
+NAMES = ("coulomb", "damping", "inertia")
+
+
+def search_of(left, train, channel):
+    problem = SimpleNamespace(
+        is_within_tolerance=lambda effect: False, by_equations=True,
+        dynamics=SimpleNamespace(now=lambda kind, at: {"kp": 10.0}),
+    )  # fmt: skip
+    return SimpleNamespace(
+        train=train, channel=channel, problem=problem, error=lambda score: score,
+        plan=SimpleNamespace(least_gain=0.1),
+    )  # fmt: skip
+
+
+def test_what_joints_lack_of_several_kinds_is_found_at_once():
+    """Friction, rotor and gain of two joints, and a load that both feel. A smaller gain
+    makes all else as much smaller in what the drive is told."""
+    rng = np.random.default_rng(1)
+    n, gains = 3000, (0.4, 1.0)
+    channel, train = np.repeat([0, 1], n), np.arange(2 * n) // 30 % 3 != 1
+    v = rng.normal(size=(2, n))
+    a = 0.5 * v + rng.normal(size=(2, n))
+    need = np.sign(v) + 2.0 * v + 3.0 * a + rng.normal(size=(2, n))
+    load = rng.normal(size=2 * n) + np.concatenate(a)
+    hidden = {KINDS[0]: 0.7, KINDS[2]: 0.05}
+    left = 0.01 * rng.normal(size=2 * n) + 0.3 * load
+    found = [Candidate("payload", ("r.hand",), 1, (load[:, None],),
+                       (lambda c: {"mass": 1.0 + c[0], "com_x": 0.0, "com_y": 0.0,
+                                   "com_z": 0.0},))]  # fmt: skip
+    for i, joint in enumerate(("r.j1", "r.j2")):
+        mine = channel == i
+        each = dict(zip(KINDS, (np.sign(v[i]), v[i], a[i]), strict=True))
+        for (kind, x), name in zip(each.items(), NAMES, strict=True):
+            column = np.zeros(2 * n)
+            column[mine] = x
+            left += hidden.get(kind, 0.0) / gains[i] * column
+            read = (lambda c, name=name: {name: float(c[0])},)
+            found.append(Candidate(kind, (joint,), 1, (column[:, None],), read))
+        column = np.zeros(2 * n)
+        column[mine] = -need[i] / 10.0
+        left += 10.0 * (1.0 - 1.0 / gains[i]) * column
+        read = (lambda c: {"kp": 10.0 / (1.0 - c[0] / 10.0)},)
+        found.append(Candidate("servo_gain", (joint,), 1, (column[:, None],), read))
+    search = search_of(left, train, channel)
+    screen = Screen(left, np.zeros((2 * n, 0)), np.zeros(0), train)
+    (group,) = (g for g in groups_of(found) if g.kind == KINDS[0])
+    wider = of_more_kinds(search, screen, found, group)
+    truth = {(kind, f"r.j{i + 1}"): x for kind, x in hidden.items() for i in range(2)}
+    truth[("servo_gain", "r.j1")] = 10.0 * gains[0]
+    truth[("payload", "r.hand")] = 1.3
+    ours = {(e.kind, e.at[0]): next(iter(e.parameters.values())) for e in wider.effects}
+    assert ours.keys() == truth.keys()
+    for key, value in truth.items():
+        assert ours[key] == pytest.approx(value, rel=0.02), key
