@@ -29,6 +29,7 @@ from makebreak.gap.residuals.mechanism_candidates import (
     inseparable,
     is_mass_of,
     nuisances,
+    of_no_scene,
     rich_columns,
     tolerances,
 )
@@ -723,6 +724,11 @@ class MechanismProblem(InverseModel, GapProblem):
         else:
             model = self
         moved = moved_links(self, nuisances, end.b)
+        size = dict(zip(nuisances.names, end.b, strict=True))
+        columns, _, names = of_no_scene(model)
+        known = np.zeros(len(model.train()))
+        for name, column in zip(names, columns, strict=True):
+            known += size.get(name, 0.0) * column
         slow = self._expected_noise(start, end)
         expects = self._says_expected(slow)
 
@@ -730,7 +736,7 @@ class MechanismProblem(InverseModel, GapProblem):
             noise: dict[str, float],
         ) -> tuple[GapMeasure, list[Series], list[Where]] | None:
             return measure(
-                scene, effects, moved, model, model is not self, jobs,
+                scene, effects, moved, model, known, model is not self, jobs,
                 self._is_pushed if model is self else lambda window: False, noise,
             )  # fmt: skip
 

@@ -201,15 +201,23 @@ def nuisances(model: InverseModel, effects: Sequence[Effect] = ()) -> Nuisances:
                     columns.append(x[:, k])
                     prior.append(tolerance.of(now[k]))
                     names.append(f"{kind} of {at}, {unknown}")
-    for more, std, of_what in (
-        model.filter_timing(), model.loop_timing(), gain_columns(model),
-    ):  # fmt: skip
-        columns, prior, names = columns + more, prior + std, names + of_what
+    more, std, of_what = of_no_scene(model)
+    columns, prior, names = columns + more, prior + std, names + of_what
     if not columns:
         return Nuisances.none(len(model.train()))
     return Nuisances(
         np.stack(columns, axis=1), np.array(prior), tuple(names), NUISANCE_LIMIT
     )
+
+
+def of_no_scene(
+    model: InverseModel,
+) -> tuple[list[np.ndarray], list[float], list[str]]:
+    """Columns (m,), standard deviations and names of nuisances that are no effects of
+    a scene: instants of sampling, and gains of drives."""
+    parts = model.filter_timing(), model.loop_timing(), gain_columns(model)
+    columns, prior, names = (sum(each, []) for each in zip(*parts, strict=True))
+    return columns, prior, names
 
 
 def unit_of_mass(model: InverseModel) -> str | None:

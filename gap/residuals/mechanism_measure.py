@@ -35,6 +35,7 @@ def measure(
     effects: Sequence[Effect],
     moved: Sequence[Effect],
     motion: InverseModel,
+    known: np.ndarray,
     every: bool,
     jobs: int = 1,
     skip: Callable[[Window], bool] = lambda window: False,
@@ -45,7 +46,8 @@ def measure(
 
     Args: effects: to be added. moved: the background as far as its tolerance lets it,
         in both, as it is neither the gap nor its cure. motion: what tells how far a
-        joint lags its motor where a window starts. every: all windows, of recordings
+        joint lags its motor where a window starts. known (m,): what else of its
+        equations the background explains, in both. every: all windows, of recordings
         that are only reported on; else those that were not fitted. skip: windows that
         count in neither. slow_noise: as WindowModel.
     """
@@ -76,7 +78,7 @@ def measure(
         return why_stopped(model, trials[-1 if with_effects else 0], k)
 
     gap = gap_measure(model, before, after, held, why)
-    equations, by_block = _equations(motion, trials[0], trials[-1], every)
+    equations, by_block = _equations(motion, trials[0], trials[-1], known, every)
     gap = replace(gap, equations=equations, by_block=by_block)
     if gap.is_measured:
         where = where_in_windows(model, model.errors(before)) if every else []
@@ -116,7 +118,7 @@ def _simulated(model: WindowModel, effects: Sequence[Effect], held, lag):
 
 
 def _equations(
-    motion: InverseModel, before, after, every: bool
+    motion: InverseModel, before, after, known: np.ndarray, every: bool
 ) -> tuple[dict[str, InUnits], dict[str, np.ndarray]]:
     """What the model leaves of each joint's effort, in its unit; and its mean squares
     over the noise by block of time (GapMeasure.by_block)."""
@@ -124,7 +126,7 @@ def _equations(
     rows = np.ones(len(motion.train()), bool) if every else ~motion.train()
     rows = rows.reshape(-1, n)[:, 0]
     try:
-        both = [motion.residual(each) for each in (before, after)]
+        both = [motion.residual(each) - known for each in (before, after)]
     except ValueError:
         return {}, {}
     left = [motion.in_units(r) for r in both]
