@@ -15,7 +15,6 @@ from scipy.stats import chi2, norm, wilcoxon
 from scipy.stats import t as student_t
 
 from makebreak.gap.numerics.runs import starts_of_runs
-from makebreak.gap.thresholds import FREE_TOLERANCE
 
 # Blocks that tell a parameter, of which a scatter is taken (one draw in 400 has none of
 # six), or this share of few: those that say more than others count as fewer.
@@ -113,10 +112,10 @@ class Screen:
         left = self.r - columns @ (c / size) - self._N @ b
         return self._fit(c / size, spread / size, b, left)
 
-    def beside(self, columns) -> "Screen":
-        """The same, with further columns (m, k) that are practically free."""
+    def beside(self, columns, known_to: float) -> "Screen":
+        """The same, with further columns (m, k) as nuisances of this deviation."""
         r, nuisance, prior, *rest = self._given
-        prior = np.append(prior, np.full(columns.shape[1], FREE_TOLERANCE))
+        prior = np.append(prior, np.full(columns.shape[1], known_to))
         return Screen(r, np.hstack([nuisance, columns]), prior, *rest)
 
     def without_each(self, columns, of) -> np.ndarray:

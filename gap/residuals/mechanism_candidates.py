@@ -215,8 +215,9 @@ def of_no_scene(
 ) -> tuple[list[np.ndarray], list[float], list[str]]:
     """Columns (m,), standard deviations and names of nuisances that are no effects of
     a scene: instants of sampling, and gains of drives."""
-    parts = model.filter_timing(), model.loop_timing(), gain_columns(model)
-    columns, prior, names = (sum(each, []) for each in zip(*parts, strict=True))
+    columns, prior, names = gain_columns(model)
+    for more, std, of_what in (model.loop_timing(), model.filter_timing()):
+        columns, prior, names = more + columns, std + prior, of_what + names
     return columns, prior, names
 
 

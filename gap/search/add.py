@@ -94,11 +94,12 @@ def add_next(
     pick = rivals.needed(trials, first, chosen)
     # Where two effects nearly cancel a third may be needed beside each of them alone.
     both = rivals.both_needed(trials, (first, pick), chosen)
-    pair = _pair(search, both, (wide, screen), chosen, ranked, trials, pick)
-    instead = [each for each in (pair, _wider(search, (wide, screen), chosen, free,
-                                              trials[pick])) if each]  # fmt: skip
-    if instead:
-        trials.append(instead[-1])
+    screens = wide, screen
+    more = _wider(search, screens, chosen, free, trials[pick])
+    if more is None:
+        more = _pair(search, both, screens, chosen, ranked, trials, pick)
+    if more is not None:
+        trials.append(more)
         pick = len(trials) - 1
     before = screen.fit_nuisances(current.r)[1]
     strained = search.is_strained(current)

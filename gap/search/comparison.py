@@ -74,11 +74,10 @@ class Comparison:
         n = self.nuisances
         scale = max(scale, 1.0) * self.problem.correlation
         limit = n.reach if reach is None else reach
-        columns, prior = n.columns, n.prior
-        if slopes is not None and slopes.shape[1]:
-            columns = np.hstack([columns, slopes])
-            prior = np.append(prior, np.full(slopes.shape[1], FREE_TOLERANCE))
-        return Screen(r, columns, prior, self.train, scale, limit)
+        screen = Screen(r, n.columns, n.prior, self.train, scale, limit)
+        if slopes is None or not slopes.shape[1]:
+            return screen
+        return screen.beside(slopes, FREE_TOLERANCE)
 
     def slopes(
         self, chosen: Sequence[Choice], current: Fitted, problem=None

@@ -17,6 +17,7 @@ from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.search.screen import Ranked, rank
 from makebreak.gap.thresholds import (
     CHANNEL_GAIN,
+    FREE_TOLERANCE,
     MEMBER_GAIN,
     MEMBER_Z,
     MEMBERS_MIN,
@@ -59,7 +60,7 @@ def of_more_kinds(
     ]  # fmt: skip
     there = {id(m) for m in members}
     others = [c for c in free if not c.members and id(c) not in there]
-    wide = screen.beside(np.hstack([m.columns[0] for m in members]))
+    wide = screen.beside(_columns_of(members)[0], FREE_TOLERANCE)
     score = search.error(wide.evaluate(wide.r).score)
     while True:
         best = next((x for x in rank(wide, others) if x.valid), None)
@@ -73,7 +74,7 @@ def of_more_kinds(
             replace(of, columns=(best.columns,), to_parameters=(of.to_parameters[k],))
         )
         others = [c for c in others if c is not of]
-        wide, score = wide.beside(best.columns), less
+        wide, score = wide.beside(best.columns, FREE_TOLERANCE), less
     whole = replace(group, members=tuple(members))
     wider = _pruned(search, screen, Ranked(whole, screen.fit(), (), True, 0))
     if wider is None or {m.kind for m in wider.candidate.members} == {group.kind}:
