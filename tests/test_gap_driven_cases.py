@@ -13,6 +13,7 @@ from gap_benchmark.driven_cases import (  # noqa: E402
     cases,
     inertias,
     make,
+    mjcf_of,
     model_of,
     robot_of,
     run,
@@ -51,7 +52,7 @@ def test_robots_have_their_joints_and_hang_together(kind):
     robot = robot_of(kind, np.random.default_rng(0))
     assert len(robot.joints) == JOINTS[kind]
     assert (inertias(robot) > 0.0).all()
-    model, _, _ = model_of(robot)
+    model, _, _ = model_of(robot, mjcf_of(robot))
     limbs = {"legs12": 4, "hand16": 4, "humanoid23": 3, "humanoid29": 3}.get(kind, 1)
     assert np.count_nonzero(model.body_parentid[1:] == 0) == limbs
 
