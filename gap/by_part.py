@@ -15,6 +15,7 @@ import numpy as np
 from makebreak.gap.data.recording import Recording
 from makebreak.gap.data.split import Split
 from makebreak.gap.result import AGREES, GapMeasure, GapResult, InUnits, NamedEffect
+from makebreak.gap.search.choice import called
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import full_name, one_dof_joints, sentence
@@ -167,8 +168,10 @@ def _said_alike(results: Sequence[GapResult]) -> list[GapResult]:
         effects, words = [alike(e) for e in r.effects], r.says
         for old, new in zip(r.effects, effects, strict=True):
             words = words.replace(old.says, new.says)
-            words = words.replace(f"distinguish it from {new.kind}",
-                                  f"distinguish it from {old.kind}")  # fmt: skip
+            it, other = (called(e.effect()) for e in (old, new))
+            for a, b in (("it", "it"), (it, other)):
+                words = words.replace(f"distinguish {a} from {new.kind}",
+                                      f"distinguish {b} from {old.kind}")  # fmt: skip
         found.append(replace(r, effects=effects, says=words))
     return found
 

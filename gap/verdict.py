@@ -209,6 +209,9 @@ def tried(choice: Choice, why: str, plant: MultibodyPlant) -> Tried:
     return Tried(each.kind, each.at, each.parameters, each.says, why)
 
 
+MANY_ALIKE = 4  # Joints with an effect of one kind, of which one sentence tells.
+
+
 def says_tried(of: Sequence[Tried]) -> str:
     """What was tried, with its value and why it is not named, as sentences: those with
     one reason together."""
@@ -323,6 +326,42 @@ def named(choice: Choice, plant: MultibodyPlant, beside: str = "") -> NamedEffec
     )
 
 
+def together(
+    effects: Sequence[NamedEffect],
+) -> list[tuple[str, list[NamedEffect]]]:
+    """A sentence for each effect, and one for many joints that have the same kind, of
+    one parameter, in one direction and without ties; with whom it is of."""
+    groups: dict[object, list[NamedEffect]] = {}
+    for k, each in enumerate(effects):
+        key: object = k
+        if KINDS[each.kind].at in ("joint", "actuator", "drive") and not (
+            each.indistinguishable_from or each.sets
+        ):
+            values = [(p.unit, p.value < 0.0) for p in each.parameters.values()]
+            key = (each.kind, *values) if len(values) == 1 else k
+        groups.setdefault(key, []).append(each)
+    found = []
+    for same in groups.values():
+        if len(same) < MANY_ALIKE:
+            found += [(each.says, [each]) for each in same]
+        else:
+            found.append((_of_each(same), same))
+    return found
+
+
+def _of_each(same: Sequence[NamedEffect]) -> str:
+    """One sentence of effects of a kind with one parameter, with the range of it."""
+    kind = KINDS[same[0].kind]
+    ((name, first),) = same[0].parameters.items()
+    sizes = [abs(p.value) for each in same for p in each.parameters.values()]
+    n = sum(len(each.at) for each in same)
+    is_less = bool(kind.says_less) and first.value < 0.0
+    values = f"{figure(min(sizes))} to {figure(max(sizes))} {first.unit}".rstrip()
+    words = {"at": f"each of {n} joints", name: values}
+    said = (kind.says_less if is_less else kind.says).format(**words)
+    return f"{said[:1].upper()}{said[1:]}."
+
+
 def says(
     verdict: str,
     effects: Sequence[NamedEffect],
@@ -348,7 +387,7 @@ def says(
             "To leave a channel out, write `columns: {name: null}` in the recording's "
             "sidecar."
         )
-    words = " ".join(each.says for each in effects)
+    words = " ".join(said for said, _ in together(effects))
     if verdict == "gap_unnamed":
         head = f"{words} Beyond that, " if words else ""
         error = f"{after} times the expected error"
@@ -379,18 +418,17 @@ def says(
 
 def _apart_from(effects: Sequence[NamedEffect]) -> str:
     """What the data do not tell the effects from, in words."""
-    kinds = sorted(
-        {t.kind for e in effects for t in e.indistinguishable_from if t.kind != e.kind}
-    )
-    places = sorted(
-        {", ".join(t.at) for e in effects for t in e.indistinguishable_from
-         if t.kind == e.kind}
-    )  # fmt: skip
     text = ""
-    if kinds:
-        text += f" These data cannot distinguish it from {', '.join(kinds)}."
-    if places:
-        text += f" It could equally be at {' or '.join(places)}."
+    for each in effects:
+        it = "it" if len(effects) == 1 else called(each.effect())
+        ties = each.indistinguishable_from
+        kinds = sorted({t.kind for t in ties if t.kind != each.kind})
+        places = sorted({", ".join(t.at) for t in ties if t.kind == each.kind})
+        if kinds:
+            text += f" These data cannot distinguish {it} from {', '.join(kinds)}."
+        if places:
+            it = it[:1].upper() + it[1:]
+            text += f" {it} could equally be at {' or '.join(places)}."
     for each in effects:
         for rival in each.sets:
             two = [f"{each.kind} at {', '.join(each.at)}", *map(called, rival.beside)]

@@ -11,8 +11,10 @@ from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Candidate
 from makebreak.gap.residuals.mechanism import MechanismProblem
+from makebreak.gap.result import Estimate, Evidence, NamedEffect
 from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.search.groups import groups_of, of_more_kinds
+from makebreak.gap.verdict import together
 from makebreak.models.effects.kind import Effect
 
 
@@ -109,3 +111,28 @@ def test_what_joints_lack_of_several_kinds_is_found_at_once():
     assert ours.keys() == truth.keys()
     for key, value in truth.items():
         assert ours[key] == pytest.approx(value, rel=0.02), key
+
+
+def effect_at(joint, value, ties=()):
+    unit = "N m s/rad"
+    return NamedEffect(
+        "joint_viscous_damping", (f"r.{joint}",),
+        {"damping": Estimate(value, 0.01, unit)}, f"{joint}: {value}.",
+        Evidence(1.0, 0.5, "", 0.0), ties, "",
+    )  # fmt: skip
+
+
+def test_what_many_joints_have_is_one_sentence():
+    """Those that have less, and those with a tie, are said by themselves."""
+    more = [effect_at(f"j{k}", 0.1 * k) for k in range(1, 6)]
+    less = [effect_at("k", -0.3)]
+    tie = Effect("joint_quadratic_drag", ["r.t"], {"coefficient": 1.0})
+    tied = [effect_at("t", 0.2, (tie,))]
+    found = together([*more[:2], *less, *more[2:], *tied])
+    assert found == [
+        ("Each of 5 joints has 0.1 to 0.5 N m s/rad of viscous damping that the model "
+         "lacks.", more),
+        ("k: -0.3.", less),
+        ("t: 0.2.", tied),
+    ]  # fmt: skip
+    assert [said for said, _ in together(more[:3])] == [e.says for e in more[:3]]

@@ -256,13 +256,7 @@ def test_held_out_windows_of_equations_are_stepped_by_compiled_code(
             simulation = mechanism_measure._compiled(scene, truth)
             assert isinstance(simulation, DrivenArmSimulation)
         gap, _, _ = mechanism_measure.measure(
-            scene,
-            truth,
-            [],
-            motion,
-            np.zeros(len(motion.base())),
-            True,
-            skip=lambda w: w.start > 4.0,
+            scene, truth, [], motion, True, skip=lambda w: w.start > 4.0
         )
         found.append((gap.before, gap.after))
     assert asked and found[0][1] < 0.5 * found[0][0]

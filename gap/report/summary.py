@@ -6,6 +6,7 @@ import numpy as np
 
 from makebreak.gap.data.findings import Finding
 from makebreak.gap.result import Evidence, GapResult, NamedEffect
+from makebreak.gap.verdict import together as together_of
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, sentence
 
@@ -34,9 +35,10 @@ def summary_lines(result: GapResult) -> list[str]:
     """The end of the command line's run: the verdict, and a line for each effect."""
     lines = [f"{heading_of(result)[0]}: {result.says}"]
     lines += [f"  Doubtful data: {each}" for each, _ in doubts(result)]
+    for said, _ in together_of(result.effects):
+        if said not in result.says:
+            lines.append(f"  {said}")
     for each in result.effects:
-        if each.says not in result.says:
-            lines.append(f"  {each.says}")
         for other in each.indistinguishable_from:
             lines.append(f"    or: {says_of(other)}")
         lines += [f"    or: {says}" for says in sets_of(each)]

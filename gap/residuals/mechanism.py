@@ -736,8 +736,9 @@ class MechanismProblem(InverseModel, GapProblem):
             noise: dict[str, float],
         ) -> tuple[GapMeasure, list[Series], list[Where]] | None:
             return measure(
-                scene, effects, moved, model, known, model is not self, jobs,
+                scene, effects, moved, model, model is not self, jobs,
                 self._is_pushed if model is self else lambda window: False, noise,
+                known,
             )  # fmt: skip
 
         measured = measured_with(slow)

@@ -35,21 +35,21 @@ def measure(
     effects: Sequence[Effect],
     moved: Sequence[Effect],
     motion: InverseModel,
-    known: np.ndarray,
     every: bool,
     jobs: int = 1,
     skip: Callable[[Window], bool] = lambda window: False,
     slow_noise: Mapping[str, float] | None = None,
+    known: np.ndarray | float = 0.0,
 ) -> tuple[GapMeasure, list[Series], list[Where]] | None:
     """Before and after over windows of the recordings that `motion` has, and where
     these stand out before; None where no window counts.
 
     Args: effects: to be added. moved: the background as far as its tolerance lets it,
         in both, as it is neither the gap nor its cure. motion: what tells how far a
-        joint lags its motor where a window starts. known (m,): what else of its
-        equations the background explains, in both. every: all windows, of recordings
+        joint lags its motor where a window starts. every: all windows, of recordings
         that are only reported on; else those that were not fitted. skip: windows that
-        count in neither. slow_noise: as WindowModel.
+        count in neither. slow_noise: as WindowModel. known (m,): what else of the
+        equations the background explains, in both.
     """
     model = WindowModel(
         scene, motion.recordings, WINDOW_SEC, most=240, slow_noise=slow_noise,
@@ -118,7 +118,7 @@ def _simulated(model: WindowModel, effects: Sequence[Effect], held, lag):
 
 
 def _equations(
-    motion: InverseModel, before, after, known: np.ndarray, every: bool
+    motion: InverseModel, before, after, known: np.ndarray | float, every: bool
 ) -> tuple[dict[str, InUnits], dict[str, np.ndarray]]:
     """What the model leaves of each joint's effort, in its unit; and its mean squares
     over the noise by block of time (GapMeasure.by_block)."""
