@@ -36,6 +36,7 @@ from makebreak.gap.data.check_drives import (
 )
 from makebreak.gap.data.check_meshes import check_meshes
 from makebreak.gap.data.checks import check_recordings
+from makebreak.gap.data.command_clock import moved_sooner
 from makebreak.gap.data.conditioning import condition
 from makebreak.gap.data.content import check_contents
 from makebreak.gap.data.findings import Finding
@@ -266,14 +267,15 @@ def _compared(
     decided, reported, done = _conditioned(parts, dynamics, is_mechanism and not meets)
     say("preparing motions and windows")
     problem, found = problem_for(scene, decided, dynamics, jobs, meets)
-    if isinstance(problem, MechanismProblem) and problem.commands_are_samples():
+    as_they_act, told = _commands_of(problem)
+    if as_they_act is not None:
         parts = replace(
-            parts, decided=sampled_commands.as_samples(parts.decided),
-            reported=sampled_commands.as_samples(parts.reported),
+            parts, decided=as_they_act(parts.decided),
+            reported=as_they_act(parts.reported),
         )  # fmt: skip
         decided, reported, done = _conditioned(parts, dynamics, not meets)
         problem, found = problem_for(scene, decided, dynamics, jobs, meets)
-        found.append(sampled_commands.finding(decided))
+        found += told
     checks += [*done, *found]
     seconds["screen"] = clock.lap()
     say("searching the catalogue")
@@ -370,6 +372,20 @@ def _conditioned(
     reported = with_noise_of(reported, decided)
     decided, cut = _shortened(decided, dynamics)
     return decided, reported, [*done, *cut]
+
+
+def _commands_of(problem: GapProblem):
+    """What makes commands (of recordings) what the motion says that they are, None
+    where they are as their rows have them; and what is said of it."""
+    if isinstance(problem, MechanismProblem):
+        if problem.commands_are_samples():
+            said = sampled_commands.finding(problem.recordings)
+            return sampled_commands.as_samples, [said]
+        if early := problem.commands_early():
+            first, row = problem.recordings[0], problem.row_sec()
+            said = sampled_commands.finding_of_moved(first.name, -early, row)
+            return partial(moved_sooner, early=early), [said]
+    return None, []
 
 
 def problem_for(
@@ -859,10 +875,10 @@ def _settle_step(
     most = TOLD_BY if is_mechanism else ASKED
     try:
         coarse_model = WindowModel(scene, recordings, WINDOW_SEC, most=most)
-    except DoesNotFit:
+        fine_model = copy(coarse_model)  # Of the same windows.
+        fine_model.scene, fine_model.simulation = fine, SceneSimulation(fine)
+    except (DoesNotFit, ValueError):  # Drives too stiff for a continuous plant.
         return scene, []
-    fine_model = copy(coarse_model)  # Of the same windows.
-    fine_model.scene, fine_model.simulation = fine, SceneSimulation(fine)
     both = [partial(m.simulate, ()) for m in (coarse_model, fine_model)]
     a, b = side_by_side(both, jobs)
     off = [

@@ -229,7 +229,12 @@ def _expanded(path: Path, packages: Mapping[str, str]) -> str:
     before = substitution_args._eval_find
     substitution_args._eval_find = find  # It asks ROS, which need not be there.
     try:
-        return xacro.process_file(str(path)).toxml()
+        # A root may ask for an argument that only lines below declare.
+        declared = re.findall(r"<xacro:arg\b[^>]*>", path.read_text())
+        pairs = (dict(re.findall(r'(\w+)="([^"]*)"', each)) for each in declared)
+        given = {x["name"]: x["default"] for x in pairs
+                 if "name" in x and "$" not in x.get("default", "$")}  # fmt: skip
+        return xacro.process_file(str(path), mappings=given).toxml()
     except Exception as error:  # It raises many types, of Python's too.
         why = " ".join(str(error).split())
         if "substitution argument" in why:  # One that has no default.

@@ -59,6 +59,19 @@ def _on_clock_of(
     return _with_rows(recording, names, instants), [finding]
 
 
+def moved_sooner(recordings: Sequence[Recording], early: float) -> list[Recording]:
+    """The recordings with positions and velocities commanded so much sooner [s]."""
+    out = []
+    for r in recordings:
+        names = [c.name for c in r.commands() if c.quantity != "effort_command"]
+        instants = []
+        for episode in r.episodes:
+            at = r.time[episode.rows][_changed(r, episode, names)]
+            instants.append((at, at - early))
+        out.append(_with_rows(r, names, instants))
+    return out
+
+
 def ticks(before: np.ndarray, after: np.ndarray) -> np.ndarray | None:
     """The latest ticks (n,) of an even clock, one in each interval (before, after] (n,)
     [s]; None if there is no such clock. Ticks at which nothing changed are allowed."""
@@ -130,10 +143,15 @@ def _instants(recording: Recording, episode: Episode, names: Sequence[str]):
     time = recording.time[episode.rows]
     if not names or len(time) < 3:
         return None
-    each = [changes(recording.held(name)[episode.rows]) for name in names]
-    changed = 1 + np.flatnonzero(np.any(each, axis=0)[1:])
+    changed = _changed(recording, episode, names)
     found = ticks(time[changed - 1], time[changed])
     return None if found is None else (time[changed], found)
+
+
+def _changed(recording: Recording, episode: Episode, names: Sequence[str]):
+    """The rows of an episode, but its first, in which one of these commands changed."""
+    each = [changes(recording.held(name)[episode.rows]) for name in names]
+    return 1 + np.flatnonzero(np.any(each, axis=0)[1:])
 
 
 def _with_rows(recording: Recording, names: Sequence[str], instants) -> Recording:

@@ -61,13 +61,12 @@ from makebreak.gap.data.table import (
 )
 from makebreak.gap.data.units import DEG, FULL_RANGE, said_of_units
 from makebreak.models.effects import KINDS
-from makebreak.models.effects.actuation_path import FASTEST
 from makebreak.models.effects.joints import ROTOR
 from makebreak.models.effects.kind import actuator_of, one_dof_joints
 from makebreak.models.fixed_joints import couplings_in, fix_joints
 from makebreak.models.model_files import checked_inertias, without_lost_collisions
 from makebreak.models.model_inertias import ModelText, mended
-from makebreak.models.robot_file import RobotFile
+from makebreak.models.robot_file import FileDrive, RobotFile
 from makebreak.models.scene_reader import given_packages
 
 GUESSED_KP = 10.0  # [N m/rad], where the log does not show it.
@@ -80,6 +79,7 @@ ROTOR_SEC = 0.05  # Of its inertia at the joint to kd.
 GAINS_KNOWN_TO = 0.05  # Of those that motion tells; the masses alone are off by 3 %.
 LEAST_ROTOR = 0.05  # Of what a joint moves: less is left out of a proposal.
 DRIVEN_SHARE = 0.5  # Of its weight and motion, the effort that a driven joint needs.
+BEYOND = 1.05  # Of a drive's limit: more than noise of an effort at it.
 LEAST_LOAD = 0.05  # Of a joint's rms gravity torque [N m], to tell its servo by.
 
 
@@ -377,7 +377,8 @@ class Judged:
     """Logs' columns by their names and by what is in them. robot: without joints that
     are taken to stand still, fixed {joint: where}. unused: columns of quantities of
     unknown joints. said: what contents say beside names. servos: {joint: gains} where
-    the measured efforts are what position servos give."""
+    the measured efforts are what position servos give. most: {joint: the largest effort
+    that was measured}."""
 
     robot: Robot
     every: dict[Path, list[Match]]
@@ -385,6 +386,7 @@ class Judged:
     unused: tuple[str, ...]
     said: tuple[Said, ...]
     servos: Mapping[str, ServoGains] = field(default_factory=dict)
+    most: Mapping[str, float] = field(default_factory=dict)
 
 
 def judge_logs(robot: Robot, logs: Sequence[Log]) -> Judged:
@@ -424,9 +426,16 @@ def judge_logs(robot: Robot, logs: Sequence[Log]) -> Judged:
         every[log.path] = matches
         said += [each for each in more if each not in said]
     servos = _servos_of_efforts(robot, every, logs)
+    most: dict[str, float] = {}
+    for log in logs:
+        for name, y in _scaled(log, every[log.path]).items():
+            joint, _, what = name.rpartition(".")
+            if what == "effort_measured":
+                own = float(np.nanmax(np.abs(y), initial=0.0))
+                most[joint] = max(own, most.get(joint, 0.0))
     given = [f"{joint}.effort_measured" for joint in servos]
     every = {path: of_one_drive(matches, given) for path, matches in every.items()}
-    return Judged(robot, every, fixed, tuple(unused), tuple(said), servos)
+    return Judged(robot, every, fixed, tuple(unused), tuple(said), servos, most)
 
 
 def _servos_of_efforts(robot: Robot, every, logs) -> dict[str, ServoGains]:
@@ -551,7 +560,7 @@ def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
             f"fixed_joints: {{{where}}}  # Not in the log, or coupled (mimic)."
         )
         notes.append(f"{', '.join(fixed)} {_stands(fixed)}")
-    actuation, gains = _actuation(robot, kinds, judged.servos, every, logs, notes)
+    actuation, gains = _actuation(judged, kinds, logs, notes)
     if actuation == NO_ACTUATION:
         _check_currents(every, robot, logs)
     gravity = list(robot.file.gravity)
@@ -758,10 +767,9 @@ def _file(robot: Robot) -> str:
     return f"file://{robot.path.resolve()}"
 
 
-def _actuation(
-    robot: Robot, kinds, servos, every, logs, notes: list[str]
-) -> tuple[list[str], str]:
+def _actuation(judged: Judged, kinds, logs, notes: list[str]) -> tuple[list[str], str]:
     """Lines of the scene, and how drives' gains were guessed ("": there are none)."""
+    robot, servos, every = judged.robot, judged.servos, judged.every
 
     def named(what: str) -> list[str]:
         return [j.name for j in robot.joints if j.name in kinds.get(what, ())]
@@ -788,9 +796,11 @@ def _actuation(
         stiff = {} if servos else _stiffness(robot, every, logs)
         stiff |= {joint: own.kp for joint, own in gains.items()}
         file = {f"{robot.model}.{j}": d for j, d in robot.file.drives.items() if d.kp}
-        own = servos or file
-        if all(j in file and own[j].kp == file[j].kp for j in joints):
-            return _servos_of_file(robot, joints, file, notes), ""
+        drives: Mapping[str, ServoGains | FileDrive] = servos or file
+        if all(j in file and drives[j].kp == file[j].kp for j in joints):
+            lines = _servos_of_file(robot, joints, file, notes)
+            limits = {j: file[j].limit for j in joints}
+            return [*lines, *_limits(limits, judged.most, notes)], ""
         known = [k for k in stiff.values() if k > 0.0]
         guess = float(np.median(known)) if known else GUESSED_KP
         kp = [float(f"{stiff.get(j, 0.0) or guess:.3g}") for j in joints]
@@ -809,9 +819,8 @@ def _actuation(
             f"  kp: {kp}  # [N m/rad], {told}.",
             f"  kd: {kd}  # [N m s/rad], {by_motion if every_one else 'a guess'}.",
         ]
-        limits = [robot.effort_limits.get(j, np.inf) for j in joints]
-        if all(0.0 < limit < 1e6 for limit in limits):
-            lines.append(f"  limit: {[float(x) for x in limits]}  # [N m]")
+        limits = {j: robot.effort_limits.get(j, np.inf) for j in joints}
+        lines += _limits(limits, judged.most, notes)
         if every_one:
             lines.append(f"tolerance: {{drive_gains: {GAINS_KNOWN_TO}}}")
         # A geared motor's own inertia is what its back-EMF and its spring work on.
@@ -848,19 +857,27 @@ def _actuation(
 def _servos_of_file(robot: Robot, joints, drives, notes: list[str]) -> list[str]:
     """Lines of position servos whose gains are in the file."""
     notes.append(f"drives are the position servos of {robot.path.name}")
-    limits = [drives[j].limit for j in joints]
-    limit = []
-    if any(np.isfinite(limits)):
-        own = [float(x) if np.isfinite(x) else 1e9 for x in limits]
-        limit = [f"  limit: {own}  # [N m]"]
     return [
         "actuation:",
         "  type: servo  # From the file.",
         f"  joints: [{', '.join(joints)}]",
         f"  kp: {[float(drives[j].kp) for j in joints]}  # [N m/rad]",
         f"  kd: {[float(drives[j].kd) for j in joints]}  # [N m s/rad]",
-        *limit,
     ]
+
+
+def _limits(limits: Mapping[str, float], most, notes: list[str]) -> list[str]:
+    """The line of the drives' limits, without those that measured efforts are beyond:
+    a world without them was logged."""
+    beyond = [j for j, limit in limits.items() if most.get(j, 0.0) > BEYOND * limit]
+    if beyond:
+        notes.append(
+            f"efforts of {', '.join(beyond)} are beyond the limits of the robot's "
+            "file, which are left out there"
+        )
+    own = [1e9 if j in beyond or not 0.0 < x < 1e6 else float(x)
+           for j, x in limits.items()]  # fmt: skip
+    return [f"  limit: {own}  # [N m]"] if min(own, default=1e9) < 1e9 else []
 
 
 def _time_step(robot: Robot, actuation: Sequence[str]) -> float:
@@ -868,7 +885,7 @@ def _time_step(robot: Robot, actuation: Sequence[str]) -> float:
     drives = yaml.safe_load("\n".join(actuation))["actuation"]
     moved, step = _inertia(robot), 1e-3
     for joint, kd in zip(drives.get("joints", ()), drives.get("kd", ()), strict=False):
-        while moved[joint] < kd * step and step > 0.5 / FASTEST:
+        while moved[joint] < kd * step:
             step *= 0.5
     return step
 

@@ -39,3 +39,15 @@ def finding(recordings: Sequence[Recording]) -> Finding:
         "were measured too, those drive the model in their place."
     )
     return Finding(SAMPLED_COMMANDS, name, "time", period, "s", "warning", says)
+
+
+def finding_of_moved(name: str, late: float, row: float) -> Finding:
+    """Of commands that were moved by late [s], in a log of rows so far apart [s]."""
+    which = "later" if late > 0.0 else "earlier"
+    says = (
+        f"The commands fit the motion {1e3 * abs(late):.2g} ms "
+        f"({abs(late) / row:.2g} of a row) {which} than the rows that hold them, and "
+        "were moved by that: their loop may be faster than the log, or a simulator's "
+        "(half of its step), or their stamps off."
+    )
+    return Finding(SAMPLED_COMMANDS, name, "time", late, "s", "warning", says)

@@ -9,7 +9,8 @@ windows of free motion ask for it beside whatever else joints may have.
 
 import numpy as np
 
-from makebreak.gap.data.findings import SAMPLED_COMMANDS, Finding
+from makebreak.gap.data.findings import Finding
+from makebreak.gap.data.sampled_commands import finding_of_moved
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.residuals.impacts import REACH, TIMING, ImpactProblem
 from makebreak.gap.thresholds import EVIDENCE_MIN
@@ -38,14 +39,7 @@ def set_command_times(problem: ImpactProblem) -> list[Finding]:
     if abs(late) < ENOUGH * row:
         problem.set_commands_late(0.0)
         return []
-    name, which = problem.recordings[0].name, "later" if late > 0.0 else "earlier"
-    says = (
-        f"The commands fit the free motion {1e3 * abs(late):.2g} ms "
-        f"({abs(late) / row:.2g} of a row) {which} than the rows that hold them, and "
-        "were moved by that: their loop may be faster than the log, or their stamps "
-        "off."
-    )
-    return [Finding(SAMPLED_COMMANDS, name, "time", late, "s", "warning", says)]
+    return [finding_of_moved(problem.recordings[0].name, late, row)]
 
 
 def _wanted(problem: ImpactProblem) -> float:

@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from makebreak.gap.data.findings import Finding
 from makebreak.gap.data.recording import Recording
@@ -73,6 +74,7 @@ HALF = 0.5  # Of a channel's power: what one effect more must explain to be a la
 # A rich model is fitted without what it leaves more than TRIM_Z of beside the usual, at
 # most such a share of all, until that stays the same.
 TRIMS, TRIMMED, TRIM_Z = 8, 0.3, 4.0
+EARLY_TO = 0.01  # Of a row: so well is known when commands act.
 UNWEIGHTED = 10.0  # Times what a push left, as its rows' noise.
 LAGS = 9  # Test functions over which errors may go together (0.9 s).
 OVERLAP = 1.3  # What neighbouring test functions share of white noise.
@@ -397,23 +399,7 @@ class MechanismProblem(InverseModel, GapProblem):
                                      strict=True) if has]  # fmt: skip
         if not given or any(law is not None for law in self.laws):
             return False
-        kind = next(k for k, entry in KINDS.items() if entry.path == "delay")
-        n, train = self.nuisances(), self.train()
-        # What joints may lack beside it hides when efforts act.
-        lacks = [c for c in self._found or () if c.kind not in (*SENSED, *PATH)]
-        rich = rich_columns(self, lacks)
-        written = min(r.period_sec() for r in self.recordings)  # Rows may be means.
-
-        def left(periods: float) -> np.ndarray:
-            """By rms, and robust, as no sample says when an effort jumps; of each
-            channel, as most joints may be at rest."""
-            late = Effect(kind, given, {"delay": -periods * written})
-            r = self.residual([late]) if periods else self.base()
-            fit = Screen(r, n.columns, n.prior, train, reach=n.reach).fit(rich)
-            off = self.in_noise(r - rich @ fit.c - n.columns @ fit.b)
-            each = np.median(np.abs(off).reshape(-1, len(self.names())), axis=0)
-            return np.array([rms(off), ROBUST * rms(each)])
-
+        left = self._left_by_early(given)
         shifts = (0.0, 0.25, 0.5, 0.75, 1.0)
         held, less, half, more, whole = (left(periods) for periods in shifts)
         half = np.minimum(half, more)  # Stamps of two topics differ by a part of a row.
@@ -422,6 +408,49 @@ class MechanismProblem(InverseModel, GapProblem):
         is_half = (half < less) & (half < whole) & (half <= enough)
         is_sure = gained > BESIDE_NOISE_EVIDENCE * self.correlation**2
         return bool((is_half & is_sure).any())
+
+    def commands_early(self) -> float:
+        """By how much earlier than their rows, up to half of one, drives have their
+        position and velocity commands [s]: a simulator's step of h gives what a command
+        does to a position h/2 early. 0 where that is not certain: of smooth commands it
+        is damping that the scene has too much of."""
+        told = zip(self.joints, self.laws, self.commanded, strict=True)
+        given = [j for j, law, has in told if law is not None and has]
+        if not given:
+            return 0.0
+        left = self._left_by_early(given)
+        best = minimize_scalar(
+            lambda periods: left(periods)[0], bounds=(0.0, 0.5), method="bounded",
+            options={"xatol": EARLY_TO},
+        )  # fmt: skip
+        held = left(0.0)[0]
+        gained = len(self.base()) * (held**2 - best.fun**2) / max(best.fun**2, 1.0)
+        is_sure = gained > BESIDE_NOISE_EVIDENCE * self.correlation**2
+        return float(best.x) * self.row_sec() if is_sure else 0.0
+
+    def row_sec(self) -> float:
+        """As written: rows may be means."""
+        return min(r.period_sec() for r in self.recordings)
+
+    def _left_by_early(self, given: Sequence[str]) -> Callable[[float], np.ndarray]:
+        """What is left, by rms and robust, if commands of these joints act so many rows
+        early, whatever joints may lack beside it: that hides when they act."""
+        kind = next(k for k, entry in KINDS.items() if entry.path == "delay")
+        n, train, written = self.nuisances(), self.train(), self.row_sec()
+        lacks = [c for c in self._found or () if c.kind not in (*SENSED, *PATH)]
+        rich = rich_columns(self, lacks)
+
+        def left(periods: float) -> np.ndarray:
+            """As no sample says when an effort jumps; of each channel, as most joints
+            may be at rest."""
+            late = Effect(kind, list(given), {"delay": -periods * written})
+            r = self.residual([late]) if periods else self.base()
+            fit = Screen(r, n.columns, n.prior, train, reach=n.reach).fit(rich)
+            off = self.in_noise(r - rich @ fit.c - n.columns @ fit.b)
+            each = np.median(np.abs(off).reshape(-1, len(self.names())), axis=0)
+            return np.array([rms(off), ROBUST * rms(each)])
+
+        return left
 
     # ----- The search
 

@@ -19,9 +19,7 @@ from makebreak.gap.simulation.scene_simulation import SceneSimulation
 from makebreak.gap.simulation.sensor_samples import SAME_SEC
 from makebreak.models.drives import (
     CHANNEL_STEPS,
-    STIFF_TYPES,
     actuators_of_model,
-    check_stiffness,
     drive_law,
     path_numbers,
 )
@@ -40,7 +38,6 @@ from makebreak.models.effects.kind import (
     Effect,
     full_name,
     model_names,
-    one_dof_joints,
     velocity_unit,
 )
 from makebreak.models.effects.measured_channels import ChannelMap, channel_maps
@@ -107,14 +104,10 @@ class DrivenArmScene:
                 possible(effect, plant, every)
         arm = DrivenArm(tree, **self._drives(plant, every))
         n = len(tree.parent)
-        names = {j.velocity_start(): full_name(plant, j) for j in one_dof_joints(plant)}
         q = plant.GetPositions(plant.CreateDefaultContext())
         M = np.empty((n, n))
         mass_and_bias(tree, NO_BODY_LAWS, 0.0, q, np.zeros(n), M, np.empty(n))
         mobility = np.diag(np.linalg.inv(M))
-        if self.scene.actuation.type in STIFF_TYPES:
-            for i in np.flatnonzero(arm.driven == LOOP):
-                check_stiffness(mobility[i], arm.law[i, 1] + arm.law[i, 3], names[i])
         return arm._replace(laws=self._held(arm.laws, mobility))
 
     @property
