@@ -218,6 +218,23 @@ HELD = """<mujoco><option timestep="0.0005" gravity="0 0 0"/><worldbody><body>
 diaginertia="0.05 0.05 0.05"/></body></worldbody></mujoco>"""
 
 
+def test_a_drive_of_any_stiffness_is_stepped(tmp_path):
+    """One that damps with 200 N m s/rad what has some 0.1 kg m2 closes on its command
+    with kd/kp; a continuous plant of Drake's refuses it."""
+    drive = dict(type="servo", joints=["p.j1"], kp=[2000.0], kd=[2000.0])
+    scene = pendulum(tmp_path, **drive)
+    with pytest.raises(ValueError, match="too little for that to be simulated"):
+        SceneSimulation(replace(scene, plant=replace(scene.plant, time_step=0.0)))
+    scene = replace(scene, plant=replace(scene.plant, time_step=1e-4))
+    time = np.linspace(0.0, 3.0, 301)
+    told = Commands(time, {"p.j1.position_command": np.full(len(time), 0.2)})
+    q = DrivenArmSimulation(scene).run(
+        at_rest_but({"p.j1": 0.0}), time, ["p.j1.position"], told
+    )[:, 0]
+    # Gravity pulls by less than 10 N m, of 2000.
+    np.testing.assert_allclose(q, 0.2 * (1.0 - np.exp(-time)), atol=5e-3)
+
+
 @pytest.mark.parametrize("creep_sec", [0.0, 0.001])
 def test_friction_that_holds_creeps_as_far_as_it_is_said_to(tmp_path, creep_sec):
     """With 1 ms as in MuJoCo with its solver as it comes; else not at all."""

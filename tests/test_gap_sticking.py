@@ -7,6 +7,7 @@ import pytest
 from effect_scenes import at_rest_but, double, with_effects
 from test_driven_arm import tree
 
+from makebreak.gap.data.command_clock import moved_sooner
 from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.problem import Candidate
 from makebreak.gap.residuals import mechanism_measure
@@ -73,9 +74,12 @@ def encoders(seed, std):
     return lambda rows: rows + std * rng.normal(size=rows.shape)
 
 
-def log_of(truth, joints, folder, time, told, read, what="position", creep=0.0):
+def log_of(
+    truth, joints, folder, time, told, read, what="position", creep=0.0, early=0.0
+):
     """The log of a scene that follows commands told (n, m), as encoders `read` its
-    positions (m, n); names of the positions."""
+    positions (m, n); names of the positions. early [s]: before the rows that have
+    them."""
     names = [f"{joint}.position" for joint in joints]
     columns = {f"{j}.{what}_command": u for j, u in zip(joints, told, strict=True)}
     start = told[:, 0] if what == "position" else np.zeros(len(joints))
@@ -83,7 +87,7 @@ def log_of(truth, joints, folder, time, told, read, what="position", creep=0.0):
     simulation.set_creep(creep)
     rows = simulation.run(
         at_rest_but(dict(zip(joints, start, strict=True))),
-        time, names, Commands(time, columns),
+        time, names, Commands(time - early, columns),
     )  # fmt: skip
     file = folder / "recording.csv"
     np.savetxt(
@@ -93,8 +97,9 @@ def log_of(truth, joints, folder, time, told, read, what="position", creep=0.0):
     return file, names
 
 
-def recorded(folder, arm, hidden, seed=0):
-    """A scene, and a recording of it in which `hidden` acts as well."""
+def recorded(folder, arm, hidden, seed=0, early=0.0):
+    """A scene, and a recording of it in which `hidden` acts as well, and commands act
+    before their rows [s]."""
     rng = np.random.default_rng(seed)
     scene, joints = ARMS[arm](folder)
     truth = with_effects(scene, *hidden)
@@ -104,7 +109,7 @@ def recorded(folder, arm, hidden, seed=0):
     def read(rows):
         return np.round((rows + 2e-4 * rng.normal(size=rows.shape)) / STEP) * STEP
 
-    file, names = log_of(truth, joints, folder, time, told, read)
+    file, names = log_of(truth, joints, folder, time, told, read, early=early)
     said = "".join(f"  {name}: {STEP / np.sqrt(12.0):.3g}\n" for name in names)
     file.with_suffix(".yaml").write_text("noise:\n" + said)
     write_scene(scene, folder / "scene.yaml")
@@ -120,8 +125,8 @@ def problem_of(folder, arm, hidden):
     return problem
 
 
-def equations_of(folder, arm, hidden):
-    scene, file = recorded(folder, arm, hidden)
+def equations_of(folder, arm, hidden, early=0.0):
+    scene, file = recorded(folder, arm, hidden, early=early)
     problem, _ = problem_for(scene, read_recordings([file]), SceneDynamics(scene))
     assert isinstance(problem, MechanismProblem)
     return problem
@@ -451,3 +456,16 @@ def test_all_that_joints_may_have_is_no_arm_without_a_drive(tmp_path):
     assert beside.names == tuple(n.names[k] for k in links)
     np.testing.assert_array_equal(beside.columns, n.columns[:, links])
     np.testing.assert_array_equal(beside.prior, n.prior[links])
+
+
+@pytest.mark.parametrize("early", [0.0, 0.005])
+def test_commands_that_act_before_their_rows_are_told_whatever_is_hidden(
+    tmp_path, early
+):
+    """A simulator that gives a command to the step that ends half a step later."""
+    problem = equations_of(tmp_path, "four", HIDDEN["four"], early)
+    # 50 rows a second: encoder steps of 1 mrad tell a quarter of a row to a tenth.
+    assert problem.commands_early() == pytest.approx(early, abs=5e-4)
+    moved = moved_sooner(problem.recordings, early)
+    right = MechanismProblem(problem.scene, moved)
+    assert right.commands_early() == 0.0

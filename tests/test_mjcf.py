@@ -208,6 +208,14 @@ def proposed(folder, text, columns):
     return propose_scene(robot, [read_log(folder / "log.csv")])
 
 
+def test_columns_are_held_against_the_gravity_of_the_file(tmp_path):
+    """Else efforts of a world without weight would be said to lack it."""
+    path = tmp_path / "arm.xml"
+    path.write_text(arm(top='<option gravity="0 1 -2"/>'))
+    g = read_robot(path).plant.gravity_field().gravity_vector()
+    np.testing.assert_array_equal(g, [0.0, 1.0, -2.0])
+
+
 def test_a_gear_is_applied_to_commands_of_effort_and_said(tmp_path):
     text = arm(more="<actuator><motor joint='j1' gear='50'/><motor joint='j2' "
                "gear='50'/></actuator>")  # fmt: skip

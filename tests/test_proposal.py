@@ -612,7 +612,7 @@ def test_the_unit_in_a_name_is_no_matter_of_size():
     assert (q.scale, v.scale) == (1e-3, 1.0)
 
 
-def servo_log(tmp_path, kp, kd, given, gravity=0.0):
+def servo_log(tmp_path, kp, kd, given, gravity=0.0, limit=1e3):
     """A wheel of 0.2 kg m2 in MJCF with a position servo, and a log of positions,
     commands that step each 20 ms and efforts `given(error, rate)`, with a weight's
     moment `gravity` [N m] beside it."""
@@ -621,7 +621,8 @@ def servo_log(tmp_path, kp, kd, given, gravity=0.0):
         '<mujoco model="one"><compiler angle="radian"/><worldbody><body name="link">'
         '<joint name="j" axis="0 1 0" range="-2 2" armature="0.1"/>'
         '<inertial pos="0 0 0" mass="1" diaginertia="0.2 0.2 0.2"/></body></worldbody>'
-        f'<actuator><position joint="j" kp="{kp}" kv="{kd}"/></actuator></mujoco>'
+        f'<actuator><position joint="j" kp="{kp}" kv="{kd}" '
+        f'forcerange="-{limit} {limit}"/></actuator></mujoco>'
     )
     t = 0.002 * np.arange(6000)
     q = np.sin(2.0 * t) + 0.2 * np.sin(7.0 * t)
@@ -664,3 +665,20 @@ def test_a_drive_that_stops_its_joint_within_a_millisecond_has_a_shorter_step(tm
     # 0.2 kg m2 and a rotor of 0.1: 0.67 ms.
     assert scene.plant.time_step == 0.0005
     load_scene(scene, DiagramBuilder())  # At 1 ms it refuses.
+
+
+@pytest.mark.parametrize("own", [80.0, 120.0])
+def test_a_limit_that_measured_efforts_are_beyond_is_no_limit(tmp_path, own):
+    """Of the file's own servo and of another: a world without it was logged."""
+
+    def given(e, v):
+        return own * e - 3.0 * v
+
+    def limit_of(most):
+        scene, _ = servo_log(tmp_path, 80.0, 3.0, given, limit=most)
+        return scene.actuation.limit
+
+    t = 0.002 * np.arange(6000)
+    most = 3.0 * np.abs(2.0 * np.cos(2.0 * t) + 1.4 * np.cos(7.0 * t)).max()
+    assert limit_of(2.0 * most) == [2.0 * most]
+    assert limit_of(0.5 * most) == []

@@ -212,6 +212,19 @@ def test_xacro_is_expanded_with_its_includes(tmp_path):
         read_robot(path)
 
 
+def test_an_argument_that_xacro_declares_below_has_its_default(tmp_path):
+    """As in files that take their name from a launch file."""
+    path = tmp_path / "arm.urdf.xacro"
+    path.write_text(
+        '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" name="$(arg own)">'
+        '<xacro:arg name="own" default="given"/>'
+        '<xacro:arg name="other" default="$(arg own)_2"/>'
+        f'<link name="base"/>{link("l1")}{joint("$(arg other)", "base", "l1")}</robot>'
+    )
+    (only,) = read_robot(path).joints
+    assert only.name == "given.given_2"
+
+
 FRICTION = '<dynamics damping="0.3" friction="0.2"/>'
 
 

@@ -153,6 +153,7 @@ def _load(
 
 def _plant(path: Path, file: RobotFile, text: str, welded, fixed, pose):
     plant = MultibodyPlant(0.0)
+    plant.mutable_gravity_field().set_gravity_vector(file.gravity)
     try:
         with checked_inertias():
             # Without a scene graph no mesh is looked for.
