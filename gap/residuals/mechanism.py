@@ -423,9 +423,11 @@ class MechanismProblem(InverseModel, GapProblem):
             lambda periods: left(periods)[0], bounds=(0.0, 0.5), method="bounded",
             options={"xatol": EARLY_TO},
         )  # fmt: skip
-        held = left(0.0)[0]
-        gained = len(self.base()) * (held**2 - best.fun**2) / max(best.fun**2, 1.0)
+        (held, usual), (least, then) = left(0.0), left(best.x)
+        gained = len(self.base()) * (held**2 - least**2) / max(least**2, 1.0)
         is_sure = gained > BESIDE_NOISE_EVIDENCE * self.correlation**2
+        # Not for a few rows alone, and no more than a simulator's step does.
+        is_sure &= then < usual and best.x < 0.5 - 2.0 * EARLY_TO
         return float(best.x) * self.row_sec() if is_sure else 0.0
 
     def row_sec(self) -> float:
