@@ -49,21 +49,26 @@ def step_or_default(plant: MultibodyPlant) -> float:
 
 
 def add_actuators(actuation: ActuationSection, plant: MultibodyPlant) -> None:
-    """Adds actuators to the joints that the scene drives, if their models have none.
+    """Adds actuators to the joints that the scene drives, if their models have none;
+    of a larger limit, where the scene says so.
 
     Raises: ValueError for an unknown joint.
     """
     if actuation.type == "none":
         return
     named = {full_name(plant, joint): joint for joint in one_dof_joints(plant)}
-    for name in actuation.joints:
+    for k, name in enumerate(actuation.joints):
         if name not in named:
             raise ValueError(
                 f"actuation.joints: no joint {name!r} that turns or slides: "
                 f"{nearest(name, named)}"
             )
-        if actuator_of(plant, named[name]) is None:
+        own = actuator_of(plant, named[name])
+        if own is None:
             plant.AddJointActuator(f"{named[name].name()}_actuator", named[name])
+        elif actuation.limit:
+            limit = actuation.limit[min(k, len(actuation.limit) - 1)]
+            own.set_effort_limit(max(limit, own.effort_limit()))
 
 
 def actuators_of_model(plant: MultibodyPlant, model: str) -> list:

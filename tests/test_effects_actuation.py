@@ -496,3 +496,15 @@ def test_a_drive_without_its_rotor_is_refused_where_it_would_never_end(tmp_path)
     assert J + 1.0 + least == pytest.approx(1600.0 / 2000.0)
     with pytest.raises(ValueError, match="expected 3.2 or more"):
         load_scene(pendulum(tmp_path, 0.002, **drive), DiagramBuilder())
+
+
+def test_a_limit_of_the_scene_stands_in_the_place_of_a_lower_one_of_the_file(tmp_path):
+    def limits(**more):
+        scene = pendulum(tmp_path, type="servo", joints=["p.j1"], kp=[30.0], **more)
+        plant = load_scene(scene, DiagramBuilder()).plant
+        (only,) = (plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices())
+        return only.effort_limit()
+
+    of_file = limits()
+    assert limits(limit=[2.0 * of_file]) == 2.0 * of_file
+    assert limits(limit=[0.5 * of_file]) == of_file  # The drive's law clips before.

@@ -379,7 +379,7 @@ class Judged:
     are taken to stand still, fixed {joint: where}. unused: columns of quantities of
     unknown joints. said: what contents say beside names. servos: {joint: gains} where
     the measured efforts are what position servos give. most: {joint: the largest effort
-    that was measured}."""
+    that was measured or commanded}."""
 
     robot: Robot
     every: dict[Path, list[Match]]
@@ -431,7 +431,7 @@ def judge_logs(robot: Robot, logs: Sequence[Log]) -> Judged:
     for log in logs:
         for name, y in _scaled(log, every[log.path]).items():
             joint, _, what = name.rpartition(".")
-            if what == "effort_measured":
+            if what in ("effort_measured", "effort_command"):
                 own = float(np.nanmax(np.abs(y), initial=0.0))
                 most[joint] = max(own, most.get(joint, 0.0))
     given = [f"{joint}.effort_measured" for joint in servos]
@@ -785,7 +785,13 @@ def _actuation(judged: Judged, kinds, logs, notes: list[str]) -> tuple[list[str]
                     f"{'it' if len(passive) == 1 else 'them'} no drive"
                 )
             joints = [j.name for j in robot.joints if j.name in (*joints, *untold)]
-            return [f"actuation: {{type: effort, joints: [{', '.join(joints)}]}}"], ""
+            lines = [
+                "actuation:", "  type: effort", f"  joints: [{', '.join(joints)}]",
+            ]  # fmt: skip
+            limits = {j: robot.effort_limits.get(j, np.inf) for j in joints}
+            if _beyond(limits, judged.most):
+                lines += _limits(limits, judged.most, notes)
+            return lines, ""
     joints = named("position_command") or named("velocity_command")
     rest = [name for name in named("position") if name not in joints]
     if joints and rest:
@@ -867,10 +873,14 @@ def _servos_of_file(robot: Robot, joints, drives, notes: list[str]) -> list[str]
     ]
 
 
+def _beyond(limits: Mapping[str, float], most: Mapping[str, float]) -> list[str]:
+    return [j for j, limit in limits.items() if most.get(j, 0.0) > BEYOND * limit]
+
+
 def _limits(limits: Mapping[str, float], most, notes: list[str]) -> list[str]:
-    """The line of the drives' limits, without those that measured efforts are beyond:
-    a world without them was logged."""
-    beyond = [j for j, limit in limits.items() if most.get(j, 0.0) > BEYOND * limit]
+    """The line of the drives' limits, without those that efforts are beyond: a world
+    without them was logged."""
+    beyond = _beyond(limits, most)
     if beyond:
         notes.append(
             f"efforts of {', '.join(beyond)} are beyond the limits of the robot's "
@@ -878,7 +888,8 @@ def _limits(limits: Mapping[str, float], most, notes: list[str]) -> list[str]:
         )
     own = [1e9 if j in beyond or not 0.0 < x < 1e6 else float(x)
            for j, x in limits.items()]  # fmt: skip
-    return [f"  limit: {own}  # [N m]"] if min(own, default=1e9) < 1e9 else []
+    some = beyond or min(own, default=1e9) < 1e9
+    return [f"  limit: {own}  # [N m]"] if some else []
 
 
 def _time_step(robot: Robot, actuation: Sequence[str]) -> float:
