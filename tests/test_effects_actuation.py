@@ -500,11 +500,12 @@ def test_a_drive_without_its_rotor_is_refused_where_it_would_never_end(tmp_path)
 
 def test_a_limit_of_the_scene_stands_in_the_place_of_a_lower_one_of_the_file(tmp_path):
     def limits(**more):
-        scene = pendulum(tmp_path, type="servo", joints=["p.j1"], kp=[30.0], **more)
+        drive = dict(type="servo", joints=["p.j1"], kp=[30.0], **more)
+        limit = '<limit effort="5" lower="-9" upper="9" velocity="9"/>'
+        scene = pendulum(tmp_path, joint=limit, **drive)
         plant = load_scene(scene, DiagramBuilder()).plant
         (only,) = (plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices())
         return only.effort_limit()
 
-    of_file = limits()
-    assert limits(limit=[2.0 * of_file]) == 2.0 * of_file
-    assert limits(limit=[0.5 * of_file]) == of_file  # The drive's law clips before.
+    assert limits() == 5.0 and limits(limit=[8.0]) == 8.0
+    assert limits(limit=[2.0]) == 5.0  # The drive's law clips before.
