@@ -785,13 +785,11 @@ def _actuation(judged: Judged, kinds, logs, notes: list[str]) -> tuple[list[str]
                     f"{'it' if len(passive) == 1 else 'them'} no drive"
                 )
             joints = [j.name for j in robot.joints if j.name in (*joints, *untold)]
-            lines = [
-                "actuation:", "  type: effort", f"  joints: [{', '.join(joints)}]",
-            ]  # fmt: skip
             limits = {j: robot.effort_limits.get(j, np.inf) for j in joints}
-            if _beyond(limits, judged.most):
-                lines += _limits(limits, judged.most, notes)
-            return lines, ""
+            beyond = _beyond(limits, judged.most)
+            more = _limits(limits, judged.most, notes) if beyond else []
+            keys = ["type: effort", f"joints: [{', '.join(joints)}]", *more]
+            return [f"actuation: {{{', '.join(key.strip() for key in keys)}}}"], ""
     joints = named("position_command") or named("velocity_command")
     rest = [name for name in named("position") if name not in joints]
     if joints and rest:
@@ -889,7 +887,7 @@ def _limits(limits: Mapping[str, float], most, notes: list[str]) -> list[str]:
     own = [1e9 if j in beyond or not 0.0 < x < 1e6 else float(x)
            for j, x in limits.items()]  # fmt: skip
     some = beyond or min(own, default=1e9) < 1e9
-    return [f"  limit: {own}  # [N m]"] if some else []
+    return [f"  limit: {own}"] if some else []
 
 
 def _time_step(robot: Robot, actuation: Sequence[str]) -> float:
