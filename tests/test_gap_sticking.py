@@ -458,14 +458,32 @@ def test_all_that_joints_may_have_is_no_arm_without_a_drive(tmp_path):
     np.testing.assert_array_equal(beside.prior, n.prior[links])
 
 
-@pytest.mark.parametrize("early", [0.0, 0.005])
+@pytest.mark.parametrize("early", [0.0, 0.005, 0.025])
 def test_commands_that_act_before_their_rows_are_told_whatever_is_hidden(
     tmp_path, early
 ):
-    """A simulator that gives a command to the step that ends half a step later."""
+    """A simulator that gives a command to the step that ends half a step later, and
+    one whose rows are written after the step."""
     problem = equations_of(tmp_path, "four", HIDDEN["four"], early)
     # 50 rows a second: encoder steps of 1 mrad tell a quarter of a row to a tenth.
     assert problem.commands_early() == pytest.approx(early, abs=5e-4)
     moved = moved_sooner(problem.recordings, early)
     right = MechanismProblem(problem.scene, moved)
     assert right.commands_early() == 0.0
+
+
+@pytest.mark.parametrize("early", [0.0, 0.025])
+def test_early_commands_are_not_what_joints_lack_where_all_is_smooth(tmp_path, early):
+    """To slow motions it is damping, or a rotor, of each joint; one number does it."""
+    scene, joints = four_joints(tmp_path)
+    time, told = goals(len(joints), np.random.default_rng(0))
+    for k in range(len(joints)):
+        told[k] = 0.3 * np.sin((0.8 + 0.3 * k) * time + k)
+    hidden = ("joint_viscous_damping", "p.twist", dict(damping=0.4))
+    truth = scene if early else with_effects(scene, hidden)
+    file, _ = log_of(
+        truth, joints, tmp_path, time, told, encoders(0, 1e-4), early=early
+    )
+    problem = MechanismProblem(scene, read_recordings([file]))
+    # As well as drives' own loops may be late.
+    assert problem.commands_early() == pytest.approx(early, abs=5e-3)

@@ -232,6 +232,17 @@ def test_gains_of_a_files_servos_become_the_drives(tmp_path):
     assert "guess" not in scene
 
 
+def test_ctrl_is_what_the_files_own_actuator_takes(tmp_path):
+    names = ["j1_pos", "j2_pos", "j1_ctrl", "j2_ctrl"]
+    scene = proposed(tmp_path, FILES["servos"], names).scene
+    assert "type: servo" in scene
+    velocity = '<actuator><velocity joint="j1" kv="3"/><velocity joint="j2" kv="2"/>'
+    scene = proposed(tmp_path, arm(more=f"{velocity}</actuator>"), names).scene
+    assert "type: velocity" in scene
+    motors = '<actuator><motor joint="j1"/><motor joint="j2"/></actuator>'
+    assert "type: effort" in proposed(tmp_path, arm(more=motors), names).scene
+
+
 def test_what_is_left_out_is_told(tmp_path):
     proposal = proposed(tmp_path, FILES["equality"], ["j1_pos", "j2_pos"])
     assert any("equality constraint of type connect" in n for n in proposal.notes)

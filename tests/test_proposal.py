@@ -132,6 +132,17 @@ def test_qd_is_a_speed_or_a_command_by_what_it_goes_with():
     assert channels(columns, joint)["qd1"] == "a.j.position_command"
 
 
+def test_inputs_of_all_joints_are_of_one_kind():
+    """One whose weak drive sags far below its command is as the others are."""
+    q = np.sin(3.0 * T)
+    columns = {"t": T} | {f"q{k}": q for k in (1, 2, 3)}
+    columns |= {f"ctrl{k}": q + 0.01 * np.sin(20.0 * T) for k in (1, 2)}
+    columns["ctrl3"] = 1.5 * np.sin(3.0 * T + 1.0)
+    found = channels(columns, [JointName(f"a.j{k}") for k in (1, 2, 3)])
+    commands = [f"a.j{k}.position_command" for k in (1, 2, 3)]
+    assert [found[f"ctrl{k}"] for k in (1, 2, 3)] == commands
+
+
 @pytest.mark.parametrize("time_scale, unit", [(1.0, "s"), (1e3, "ms"), (1e9, "ns")])
 def test_units_are_told_by_size_and_by_the_derivative(time_scale, unit):
     q = 1.5 * np.sin(3.0 * T)

@@ -157,27 +157,31 @@ def _changed(recording: Recording, episode: Episode, names: Sequence[str]):
 def _with_rows(recording: Recording, names: Sequence[str], instants) -> Recording:
     """The recording with rows of these commands alone at the instants at which they
     changed."""
-    times, rows, episodes, own = [], [], [], []
+    times, rows, told, episodes, own = [], [], [], [], []
     first = 0
     for episode, found in zip(recording.episodes, instants, strict=True):
         time = recording.time[episode.rows]
         at, sooner = (np.zeros(0), np.zeros(0)) if found is None else found
         new = at - sooner > 1e-6 * recording.period_sec()
         every = np.concatenate([time, sooner[new]])
-        shown = np.concatenate(
-            [np.arange(len(time)), np.searchsorted(time, at[new])]
-        )  # The row that has a new row's commands.
+        changed = np.searchsorted(time, at)
+        shown = np.concatenate([np.arange(len(time)), changed[new]])
         order = np.argsort(every, kind="stable")
         times.append(every[order])
         rows.append(episode.first + shown[order])
+        # The row whose commands act then: of the last change that has come, if any has.
+        last = np.searchsorted(sooner, every[order], "right")
+        told.append(
+            episode.first + np.append(0, changed)[last] if len(at) else rows[-1]
+        )
         own.append(order < len(time))
         episodes.append(replace(episode, first=first, last=first + len(every)))
         first += len(every)
-    shown, measured = np.concatenate(rows), np.concatenate(own)
+    shown, measured, acts = map(np.concatenate, (rows, own, told))
     moved = {}
     for name, channel in recording.channels.items():
         if name in names:
-            values = recording.held(name)[shown]
+            values = recording.held(name)[acts]
         else:
             values = np.where(measured, channel.values[shown], np.nan)
         values.setflags(write=False)

@@ -472,7 +472,7 @@ def _without_unknown_efforts(
 def _by_motion(found: dict[str, Match], columns) -> dict[str, Match]:
     """qd may be a speed or a command of position, and ctrl a command of either kind:
     what it goes with tells."""
-    out = dict(found)
+    follows: dict[str, dict[str, bool]] = {}  # {quantity: {column: whether it does}}
     for name, match in found.items():
         at, _, what = (match.channel or "").rpartition(".")
         if (what, {"qd", "ctrl"} & {*words_of(name)}) not in (
@@ -488,9 +488,16 @@ def _by_motion(found: dict[str, Match], columns) -> dict[str, Match]:
         if good.sum() < 50 or not (np.ptp(q[good]) > 0.0 and np.ptp(y[good]) > 0.0):
             continue
         near = np.std(q[good] - y[good]) < 0.5 * np.std(q[good])
-        if np.corrcoef(q[good], y[good])[0, 1] > 0.9 and near:
-            why = "it follows the position"
-            out[name] = Match(name, f"{at}.position_command", why=why)
+        follows.setdefault(what, {})[name] = bool(
+            near and np.corrcoef(q[good], y[good])[0, 1] > 0.9
+        )
+    out = dict(found)
+    for each in follows.values():  # What most joints' columns are, all are.
+        if 2 * sum(each.values()) > len(each):
+            for name in each:
+                at = str(found[name].channel).rpartition(".")[0]
+                why = "it follows the position"
+                out[name] = Match(name, f"{at}.position_command", why=why)
     return out
 
 

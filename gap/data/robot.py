@@ -14,7 +14,7 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 
-from makebreak.gap.data.arrays import is_time
+from makebreak.gap.data.arrays import is_time, words_of
 from makebreak.gap.data.bags import MotorRange, is_dataset, motor_ranges
 from makebreak.gap.data.base_pose import BasePose, base_pose
 from makebreak.gap.data.content import (
@@ -689,14 +689,20 @@ def _effects_of_file(robot: Robot, fixed, lines: Sequence[str]) -> list[str]:
 
 
 def _through_gears(robot: Robot, matches: Sequence[Match]) -> list[Match]:
-    """Commands of a file's own actuators (MJCF's ctrl) as efforts and positions of the
-    joints: an effort times the gear, a servo's command over it."""
+    """Commands of a file's own actuators (MJCF's ctrl) as efforts, positions and
+    velocities of the joints, by what each actuator takes: an effort times the gear, a
+    servo's command over it."""
     out = []
     for match in matches:
         at, _, what = (match.channel or "").rpartition(".")
         drive = robot.file.drives.get(at.partition(".")[2])
         scale = 1.0
         if drive is not None and match.why != AS_SAID:
+            if what == "effort_command" and "ctrl" in words_of(match.column):
+                if drive.kp or drive.kd:
+                    what = "position_command" if drive.kp else "velocity_command"
+                    why = f"what {robot.path.name}'s own actuator takes"
+                    match = replace(match, channel=f"{at}.{what}", why=why)
             if what == "effort_command" and not drive.kp and not drive.kd:
                 scale = drive.gear
             elif what == "position_command" and drive.kp:
@@ -826,7 +832,7 @@ def _actuation(judged: Judged, kinds, logs, notes: list[str]) -> tuple[list[str]
         ]
         limits = {j: robot.effort_limits.get(j, np.inf) for j in joints}
         lines += _limits(limits, judged.most, notes)
-        if every_one:
+        if every_one and not servos:
             lines.append(f"tolerance: {{drive_gains: {GAINS_KNOWN_TO}}}")
         # A geared motor's own inertia is what its back-EMF and its spring work on.
         rotors, moved = [], _inertia(robot)

@@ -51,6 +51,7 @@ from makebreak.gap.thresholds import (
 )
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
+from makebreak.models.effects.joints import ROTOR
 from makebreak.models.effects.kind import Effect, find_body, sliding_joints
 from makebreak.models.effects.objects import MASS
 from makebreak.models.scene import Scene
@@ -74,7 +75,9 @@ HALF = 0.5  # Of a channel's power: what one effect more must explain to be a la
 # A rich model is fitted without what it leaves more than TRIM_Z of beside the usual, at
 # most such a share of all, until that stays the same.
 TRIMS, TRIMMED, TRIM_Z = 8, 0.3, 4.0
-EARLY_TO = 0.01  # Of a row: so well is known when commands act.
+# In rows: how early commands are tried, and may be, and how well that is known.
+EARLIEST, LAST, EARLY_TO = 2.0, 1.9, 0.02
+LIKE_EARLY = ("joint_viscous_damping", ROTOR)  # To smooth motions.
 UNWEIGHTED = 10.0  # Times what a push left, as its rows' noise.
 LAGS = 9  # Test functions over which errors may go together (0.9 s).
 OVERLAP = 1.3  # What neighbouring test functions share of white noise.
@@ -410,47 +413,62 @@ class MechanismProblem(InverseModel, GapProblem):
         return bool((is_half & is_sure).any())
 
     def commands_early(self) -> float:
-        """By how much earlier than their rows, up to half of one, drives have their
-        position and velocity commands [s]: a simulator's step of h gives what a command
-        does to a position h/2 early. 0 where that is not certain: of smooth commands it
-        is damping that the scene has too much of."""
+        """By how much earlier than their rows, less than two of these, drives have
+        their position and velocity commands [s]: what a command does to a position
+        comes half a step early from a simulator's steps, and one step more where rows
+        were written after the step. 0 where that is not certain, beside whatever joints
+        may lack or, of three joints and more, if it explains as much as what does the
+        same to smooth motions."""
         told = zip(self.joints, self.laws, self.commanded, strict=True)
         given = [j for j, law, has in told if law is not None and has]
         if not given:
             return 0.0
-        left = self._left_by_early(given)
-        best = minimize_scalar(
-            lambda periods: left(periods)[0], bounds=(0.0, 0.5), method="bounded",
-            options={"xatol": EARLY_TO},
-        )  # fmt: skip
-        (held, usual), (least, then) = left(0.0), left(best.x)
-        gained = len(self.base()) * (held**2 - least**2) / max(least**2, 1.0)
-        is_sure = gained > BESIDE_NOISE_EVIDENCE * self.correlation**2
-        # Not for a few rows alone, and no more than a simulator's step does.
-        is_sure &= then < usual and best.x < 0.5 - 2.0 * EARLY_TO
-        return float(best.x) * self.row_sec() if is_sure else 0.0
+        beside = self._left_by_early(given)
+        alone = self._left_by_early(given, without=LIKE_EARLY)
+        enough = max(NOISE_RMS_MAX, (1.0 + SAME_ERROR) * beside(0.0)[0])
+        for left, most in ((beside, np.inf), (alone, enough))[: 1 + (len(given) > 2)]:
+            start = min(np.arange(0.0, EARLIEST, 0.5), key=lambda x: left(x)[0])
+            best = minimize_scalar(
+                lambda periods: left(periods)[0],  # noqa: B023
+                bounds=(max(start - 0.5, 0.0), start + 0.5), method="bounded",
+                options={"xatol": EARLY_TO},
+            )  # fmt: skip
+            (held, usual), (least, then) = left(0.0), left(best.x)
+            gained = len(self.base()) * (held**2 - least**2) / max(least**2, 1.0)
+            is_sure = gained > BESIDE_NOISE_EVIDENCE * self.correlation**2
+            is_sure &= held > NOISE_RMS_MAX
+            # Not for a few rows alone.
+            if is_sure and then < usual and least < most and best.x < LAST:
+                return float(best.x) * self.row_sec()
+        return 0.0
 
     def row_sec(self) -> float:
         """As written: rows may be means."""
         return min(r.period_sec() for r in self.recordings)
 
-    def _left_by_early(self, given: Sequence[str]) -> Callable[[float], np.ndarray]:
-        """What is left, by rms and robust, if commands of these joints act so many rows
-        early, whatever joints may lack beside it: that hides when they act."""
+    def _left_by_early(
+        self, given: Sequence[str], without: Sequence[str] = ()
+    ) -> Callable[[float], np.ndarray]:
+        """What is left, by rms (with what nuisances take) and robust, if commands of
+        these joints act so many rows early, whatever joints may lack beside it, but for
+        these kinds: that hides when they act."""
         kind = next(k for k, entry in KINDS.items() if entry.path == "delay")
         n, train, written = self.nuisances(), self.train(), self.row_sec()
-        lacks = [c for c in self._found or () if c.kind not in (*SENSED, *PATH)]
-        rich = rich_columns(self, lacks)
+        without = (*SENSED, *PATH, *without)
+        more = rich_columns(
+            self, [c for c in self._found or () if c.kind not in without]
+        )
 
         def left(periods: float) -> np.ndarray:
             """As no sample says when an effort jumps; of each channel, as most joints
             may be at rest."""
             late = Effect(kind, list(given), {"delay": -periods * written})
             r = self.residual([late]) if periods else self.base()
-            fit = Screen(r, n.columns, n.prior, train, reach=n.reach).fit(rich)
-            off = self.in_noise(r - rich @ fit.c - n.columns @ fit.b)
+            fit = Screen(r, n.columns, n.prior, train, reach=n.reach).fit(more)
+            off = self.in_noise(r - more @ fit.c - n.columns @ fit.b)
             each = np.median(np.abs(off).reshape(-1, len(self.names())), axis=0)
-            return np.array([rms(off), ROBUST * rms(each)])
+            cost = np.concatenate([off, fit.b / n.prior])
+            return np.array([rms(cost), ROBUST * rms(each)])
 
         return left
 
