@@ -482,7 +482,7 @@ def test_early_commands_are_not_what_joints_lack_where_all_is_smooth(tmp_path, e
     hidden = ("joint_viscous_damping", "p.twist", dict(damping=0.4))
     truth = scene if early else with_effects(scene, hidden)
     file, _ = log_of(
-        truth, joints, tmp_path, time, told, encoders(0, 1e-4), early=early
+        truth, joints, tmp_path, time, told, encoders(0, 2e-4), early=early
     )
     problem = MechanismProblem(scene, read_recordings([file]))
     # As well as drives' own loops may be late.

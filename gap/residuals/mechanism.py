@@ -51,7 +51,6 @@ from makebreak.gap.thresholds import (
 )
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
-from makebreak.models.effects.joints import ROTOR
 from makebreak.models.effects.kind import Effect, find_body, sliding_joints
 from makebreak.models.effects.objects import MASS
 from makebreak.models.scene import Scene
@@ -77,7 +76,7 @@ HALF = 0.5  # Of a channel's power: what one effect more must explain to be a la
 TRIMS, TRIMMED, TRIM_Z = 8, 0.3, 4.0
 # In rows: how early commands are tried, and may be, and how well that is known.
 EARLIEST, LAST, EARLY_TO = 2.0, 1.9, 0.02
-LIKE_EARLY = ("joint_viscous_damping", ROTOR)  # To smooth motions.
+LIKE_EARLY = ("N m s/rad", "kg m2")  # Units of what does the same to slow motions.
 UNWEIGHTED = 10.0  # Times what a push left, as its rows' noise.
 LAGS = 9  # Test functions over which errors may go together (0.9 s).
 OVERLAP = 1.3  # What neighbouring test functions share of white noise.
@@ -451,13 +450,14 @@ class MechanismProblem(InverseModel, GapProblem):
     ) -> Callable[[float], np.ndarray]:
         """What is left, by rms (with what nuisances take) and robust, if commands of
         these joints act so many rows early, whatever joints may lack beside it, but for
-        these kinds: that hides when they act."""
+        kinds of these units: that hides when they act."""
         kind = next(k for k, entry in KINDS.items() if entry.path == "delay")
         n, train, written = self.nuisances(), self.train(), self.row_sec()
-        without = (*SENSED, *PATH, *without)
-        more = rich_columns(
-            self, [c for c in self._found or () if c.kind not in without]
-        )
+        lacks = [
+            c for c in self._found or () if c.kind not in (*SENSED, *PATH)
+            and not {p.unit for p in KINDS[c.kind].parameters} & {*without}
+        ]  # fmt: skip
+        more = rich_columns(self, lacks)
 
         def left(periods: float) -> np.ndarray:
             """As no sample says when an effort jumps; of each channel, as most joints
