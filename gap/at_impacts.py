@@ -14,8 +14,8 @@ import numpy as np
 from makebreak.gap.problem import Outcome, rms
 from makebreak.gap.residuals.objects import FlightProblem
 from makebreak.gap.result import AGREES, GapResult
+from makebreak.gap.said import figure
 from makebreak.gap.thresholds import AGREEMENT_RMS_MAX
-from makebreak.gap.verdict import figure
 from makebreak.models.effects.kind import Effect
 
 EXPLAINED = (*AGREES, "gap_named", "ambiguous")

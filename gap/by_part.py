@@ -15,7 +15,7 @@ import numpy as np
 from makebreak.gap.data.recording import Recording
 from makebreak.gap.data.split import Split
 from makebreak.gap.result import AGREES, GapMeasure, GapResult, InUnits, NamedEffect
-from makebreak.gap.search.choice import called
+from makebreak.gap.said import called
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import full_name, one_dof_joints, sentence

@@ -18,6 +18,7 @@ from makebreak.gap.data.recording import Recording
 from makebreak.gap.fit import fit_effects
 from makebreak.gap.problem import Fitted, GapProblem, Outcome, leaves_gap
 from makebreak.gap.result import GapMeasure
+from makebreak.gap.said import figure
 from makebreak.gap.search.choice import (
     Choice,
     Selection,
@@ -33,7 +34,7 @@ from makebreak.gap.thresholds import (
     SAME_ERROR,
     SIMULATED_RIVAL_GAIN,
 )
-from makebreak.gap.verdict import closed_at, figure
+from makebreak.gap.verdict import closed_at
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
 

@@ -18,7 +18,8 @@ from makebreak.gap.result import (
     Tried,
     plain,
 )
-from makebreak.gap.search.choice import Choice, called
+from makebreak.gap.said import called, figure, said_together
+from makebreak.gap.search.choice import Choice
 from makebreak.gap.thresholds import (
     AGREEMENT_RMS_MAX,
     CLOSED_SHARE_MIN,
@@ -34,11 +35,6 @@ from makebreak.models.effects.kind import (
 )
 
 OF_CHANNEL = "(unit of the channel)"
-
-
-def figure(x: float, digits: int = 3) -> str:
-    """So many digits of x, in full: 3700 and not 3.7e+03."""
-    return f"{float(f'{x:.{digits}g}'):g}"
 
 
 def in_plain_units(gap: GapMeasure) -> str:
@@ -209,9 +205,6 @@ def tried(choice: Choice, why: str, plant: MultibodyPlant) -> Tried:
     return Tried(each.kind, each.at, each.parameters, each.says, why)
 
 
-MANY_ALIKE = 4  # Joints with an effect of one kind, of which one sentence tells.
-
-
 def says_tried(of: Sequence[Tried]) -> str:
     """What was tried, with its value and why it is not named, as sentences: those with
     one reason together."""
@@ -326,42 +319,6 @@ def named(choice: Choice, plant: MultibodyPlant, beside: str = "") -> NamedEffec
     )
 
 
-def together(
-    effects: Sequence[NamedEffect],
-) -> list[tuple[str, list[NamedEffect]]]:
-    """A sentence for each effect, and one for many joints that have the same kind, of
-    one parameter, in one direction and without ties; with whom it is of."""
-    groups: dict[object, list[NamedEffect]] = {}
-    for k, each in enumerate(effects):
-        key: object = k
-        if KINDS[each.kind].at in ("joint", "actuator", "drive") and not (
-            each.indistinguishable_from or each.sets
-        ):
-            values = [(p.unit, p.value < 0.0) for p in each.parameters.values()]
-            key = (each.kind, *values) if len(values) == 1 else k
-        groups.setdefault(key, []).append(each)
-    found = []
-    for same in groups.values():
-        if len(same) < MANY_ALIKE:
-            found += [(each.says, [each]) for each in same]
-        else:
-            found.append((_of_each(same), same))
-    return found
-
-
-def _of_each(same: Sequence[NamedEffect]) -> str:
-    """One sentence of effects of a kind with one parameter, with the range of it."""
-    kind = KINDS[same[0].kind]
-    ((name, first),) = same[0].parameters.items()
-    sizes = [abs(p.value) for each in same for p in each.parameters.values()]
-    n = sum(len(each.at) for each in same)
-    is_less = bool(kind.says_less) and first.value < 0.0
-    values = f"{figure(min(sizes))} to {figure(max(sizes))} {first.unit}".rstrip()
-    words = {"at": f"each of {n} joints", name: values}
-    said = (kind.says_less if is_less else kind.says).format(**words)
-    return f"{said[:1].upper()}{said[1:]}."
-
-
 def says(
     verdict: str,
     effects: Sequence[NamedEffect],
@@ -387,7 +344,7 @@ def says(
             "To leave a channel out, write `columns: {name: null}` in the recording's "
             "sidecar."
         )
-    words = " ".join(said for said, _ in together(effects))
+    words = " ".join(said for said, _ in said_together(effects))
     if verdict == "gap_unnamed":
         head = f"{words} Beyond that, " if words else ""
         error = f"{after} times the expected error"

@@ -84,6 +84,7 @@ from makebreak.gap.result import (
     Tried,
     Where,
 )
+from makebreak.gap.said import figure
 from makebreak.gap.search.choice import Choice, Selection
 from makebreak.gap.search.chosen_by_simulation import (
     above_step,
@@ -103,7 +104,6 @@ from makebreak.gap.thresholds import (
 from makebreak.gap.verdict import (
     Facts,
     decide,
-    figure,
     named,
     says,
     says_tried,

@@ -12,9 +12,9 @@ from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Candidate
 from makebreak.gap.residuals.mechanism import MechanismProblem
 from makebreak.gap.result import Estimate, Evidence, NamedEffect
+from makebreak.gap.said import said_together
 from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.search.groups import groups_of, of_more_kinds
-from makebreak.gap.verdict import together
 from makebreak.models.effects.kind import Effect
 
 
@@ -128,11 +128,11 @@ def test_what_many_joints_have_is_one_sentence():
     less = [effect_at("k", -0.3)]
     tie = Effect("joint_quadratic_drag", ["r.t"], {"coefficient": 1.0})
     tied = [effect_at("t", 0.2, (tie,))]
-    found = together([*more[:2], *less, *more[2:], *tied])
+    found = said_together([*more[:2], *less, *more[2:], *tied])
     assert found == [
         ("Each of 5 joints has 0.1 to 0.5 N m s/rad of viscous damping that the model "
          "lacks.", more),
         ("k: -0.3.", less),
         ("t: 0.2.", tied),
     ]  # fmt: skip
-    assert [said for said, _ in together(more[:3])] == [e.says for e in more[:3]]
+    assert [said for said, _ in said_together(more[:3])] == [e.says for e in more[:3]]

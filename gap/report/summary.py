@@ -6,7 +6,7 @@ import numpy as np
 
 from makebreak.gap.data.findings import Finding
 from makebreak.gap.result import Evidence, GapResult, NamedEffect
-from makebreak.gap.verdict import together as together_of
+from makebreak.gap.said import said_together
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, sentence
 
@@ -35,7 +35,7 @@ def summary_lines(result: GapResult) -> list[str]:
     """The end of the command line's run: the verdict, and a line for each effect."""
     lines = [f"{heading_of(result)[0]}: {result.says}"]
     lines += [f"  Doubtful data: {each}" for each, _ in doubts(result)]
-    for said, _ in together_of(result.effects):
+    for said, _ in said_together(result.effects):
         if said not in result.says:
             lines.append(f"  {said}")
     for each in result.effects:

@@ -146,11 +146,6 @@ def pair_of(a: Ranked, b: Ranked, effects: Sequence[Effect]) -> Ranked:
     return Ranked(both, a.fit, tuple(effects), True, 0)
 
 
-def called(effect: Effect) -> str:
-    """Kind and place, as a report has them."""
-    return f"{effect.kind} at {', '.join(effect.at)}"
-
-
 def complexity(candidate: Candidate) -> int:
     """Twice the number of parameters, by which the simplest is taken. A kind some of
     whose parameters are left at neutral counts little less than all of it."""

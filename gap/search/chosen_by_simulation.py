@@ -9,10 +9,10 @@ from dataclasses import replace
 from makebreak.gap.fit import fit_effects
 from makebreak.gap.problem import GapProblem, Outcome, is_sane
 from makebreak.gap.result import RivalSet
+from makebreak.gap.said import called
 from makebreak.gap.search.choice import (
     Choice,
     Selection,
-    called,
     refreshed,
     units_of,
 )

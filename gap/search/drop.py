@@ -7,9 +7,9 @@ import numpy as np
 
 from makebreak.gap.fit import fit_effects
 from makebreak.gap.problem import Candidate, Fitted, is_sane
+from makebreak.gap.said import called
 from makebreak.gap.search.choice import (
     Choice,
-    called,
     deviations_off,
     is_clearly_off,
     is_significant,

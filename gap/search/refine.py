@@ -5,9 +5,9 @@ from dataclasses import replace
 
 from makebreak.gap.fit import fit_effects
 from makebreak.gap.problem import Fitted, is_sane
+from makebreak.gap.said import called
 from makebreak.gap.search.choice import (
     Choice,
-    called,
     fixed_parameters,
     places,
     refreshed,

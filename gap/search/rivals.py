@@ -9,10 +9,10 @@ import numpy as np
 from makebreak.gap.fit import fit_effects, highest
 from makebreak.gap.numerics.selection import Screen, paired
 from makebreak.gap.problem import Candidate, Fitted, rms
+from makebreak.gap.said import called
 from makebreak.gap.search.choice import (
     Choice,
     Trial,
-    called,
     fixed_parameters,
     identifiable,
     pair_of,

@@ -14,9 +14,9 @@ from makebreak.gap.fit import fit_effects, tangents
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Candidate, Fitted
 from makebreak.gap.result import RivalSet
+from makebreak.gap.said import called
 from makebreak.gap.search.choice import (
     Choice,
-    called,
     fixed_parameters,
     identifiable,
     places,

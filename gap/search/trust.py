@@ -10,7 +10,7 @@ from makebreak.gap.fit import fit_effects
 from makebreak.gap.numerics.selection import Screen, between_parts, random_effects
 from makebreak.gap.problem import Fitted, GapProblem
 from makebreak.gap.result import Trust
-from makebreak.gap.search.choice import called
+from makebreak.gap.said import called
 from makebreak.gap.thresholds import DIFFERS_SHARE, DIFFERS_Z
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, sliding_joints, unit_at
