@@ -1,6 +1,7 @@
 """The parts of push_object beside its planner, and the whole diagram for a moment."""
 
 import re
+from copy import deepcopy
 from dataclasses import replace
 from operator import attrgetter
 
@@ -34,6 +35,7 @@ from makebreak.models.effects.kind import Effect
 from makebreak.models.pushed_object import PushedObject, object_file
 from makebreak.models.scene import read_scene
 from makebreak.models.scene_file import write_scene
+from makebreak.scripts.runner.run_timing import leaf_systems
 from makebreak.systems.changing_contact.numerics.touch_down import (
     TouchDownConfig,
     TouchSpeedConfig,
@@ -200,7 +202,7 @@ def test_readings_have_the_noise_that_is_asked_for():
     seen = []
     for k in range(300):  # A filter that trusts each reading alone.
         simulator.AdvanceTo((k + 2.01) / 30.0)
-        seen.append(sensor._pose_of(own).p[0] - 0.5)
+        seen.append(sensor._memory_of(own).pose.p[0] - 0.5)
     # The deviation of 300 samples is known to 4 %; three of that.
     assert np.std(seen) == pytest.approx(1e-3, rel=0.12)
 
@@ -601,3 +603,21 @@ def test_the_wrist_is_the_arm_s_and_no_setting():
     config.sampler.sampling.wrist = [0.1, 0.0]
     with pytest.raises(ValueError, match="sampler.sampling"):
         make_push_object(config)
+
+
+@pytest.mark.parametrize("pose_from", ["sensor", "camera"])
+def test_no_state_is_copied_array_by_array(pose_from):
+    """Drake copies abstract state at updates: here it gets the same object again."""
+    camera = CameraConfig(renderer="drawn")
+    config = PushObjectConfig(pose_from=pose_from, camera=camera)
+    diagram = make_push_object(config)
+    simulator = Simulator(diagram)
+    simulator.AdvanceTo(0.3)
+    copied = []
+    for system in leaf_systems(diagram):
+        own = system.GetMyContextFromRoot(simulator.get_context())
+        for i in range(own.num_abstract_states()):
+            value = own.get_abstract_state(i).get_value()
+            if deepcopy(value) is not value:
+                copied.append(f"{system.get_name()}: {type(value).__name__}")
+    assert not copied

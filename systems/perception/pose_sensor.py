@@ -49,6 +49,21 @@ class PoseSensorConfig:
     offset_sec: float = 0.0  # Time of the first reading [s]; the diagram sets it.
 
 
+@dataclass(frozen=True, eq=False)
+class _Memory:
+    """One value, that Drake's copies of the state share; in tuples of arrays they would
+    copy each array."""
+
+    late: tuple = ()  # Readings that have not arrived yet, oldest first.
+    known: tuple = ()  # Readings of the last KEPT_SEC that have, oldest first.
+    pose: PoseEstimate | None = None  # The filter's at the last of them.
+    # Of a rolling object.
+    rolling: interacting_models.Estimate | tuple[()] = ()
+
+    def __deepcopy__(self, memo):
+        return self  # Nothing in it is changed once it is there.
+
+
 class PoseSensor(LeafSystem):
     """Measures a body's pose and estimates its present pose and velocity.
 
@@ -98,22 +113,18 @@ class PoseSensor(LeafSystem):
         self._poses = self.DeclareAbstractInputPort(
             "body_poses", AbstractValue.Make([RigidTransform()])
         )
-        # Readings that have not arrived yet, oldest first.
-        self._late = self.DeclareAbstractState(Value[object](()))
-        # () until the first reading: Drake 1.58 cannot hold None.
-        self._pose = self.DeclareAbstractState(Value[object](()))
-        # Of a rolling object: an estimate of numerics/interacting_models.py.
-        self._rolling = self.DeclareAbstractState(Value[object](()))
-        ticket = {self.abstract_state_ticket(self._pose), self.time_ticket()}
+        self._memory = self.DeclareAbstractState(Value[object](_Memory()))
+        read = {self.abstract_state_ticket(self._memory)}
         for i, (name, size) in enumerate(
             (("p_WB", 3), ("v_WB", 3), ("q_WB", 4), ("w_WB", 3))
         ):
-            self.DeclareVectorOutputPort(name, size, self._calc(i), ticket)
-        self.DeclareVectorOutputPort("seen", 1, self._calc_seen, ticket)
-        self._known = self.DeclareAbstractState(Value[object](()))
-        self.DeclareStateOutputPort("readings", self._known)
-        ticket = {self.abstract_state_ticket(self._known)}
-        self.DeclareVectorOutputPort("reading", 8, self._calc_reading, ticket)
+            now = read | {self.time_ticket()}
+            self.DeclareVectorOutputPort(name, size, self._calc(i), now)
+        self.DeclareVectorOutputPort("seen", 1, self._calc_seen, read)
+        self.DeclareAbstractOutputPort(
+            "readings", lambda: Value[object](()), self._calc_readings, read
+        )
+        self.DeclareVectorOutputPort("reading", 8, self._calc_reading, read)
         self.DeclarePeriodicUnrestrictedUpdateEvent(
             config.period_sec, config.offset_sec, self._update
         )
@@ -130,15 +141,14 @@ class PoseSensor(LeafSystem):
             X_WB.translation() + c.noise[0] * noise[:3],
             turned(np.array(q), c.noise[1] * noise[3:]),
         )
-        late = context.get_abstract_state(int(self._late)).get_value() + (reading,)
-        pose = context.get_abstract_state(int(self._pose)).get_value()
-        known = context.get_abstract_state(int(self._known)).get_value()
-        rolling = context.get_abstract_state(int(self._rolling)).get_value()
+        memory = self._memory_of(context)
+        late, known = (*memory.late, reading), memory.known
+        pose, rolling = memory.pose, memory.rolling
         std = np.maximum(c.noise, 1e-6)  # The filter divides by it.
         while late and late[0][0] <= t - c.delay_sec + 1e-9:
             known = (*known, late[0])
             (at, p, q), late = late[0], late[1:]
-            if not pose:
+            if pose is None:
                 pose = first_pose(at, p, q, std, (0.1, 1.0))
             else:
                 pose = corrected(predicted(pose, at, c.density), p, q, std)
@@ -149,10 +159,8 @@ class PoseSensor(LeafSystem):
                     p=np.array([x, y, pose.p[2]]), v=np.array([*v, 0.0])
                 )
         known = tuple(one for one in known if one[0] > t - KEPT_SEC) or known[-1:]
-        state.get_mutable_abstract_state(int(self._late)).set_value(late)
-        state.get_mutable_abstract_state(int(self._pose)).set_value(pose)
-        state.get_mutable_abstract_state(int(self._rolling)).set_value(rolling)
-        state.get_mutable_abstract_state(int(self._known)).set_value(known)
+        memory = _Memory(late, known, pose, rolling)
+        state.get_mutable_abstract_state(int(self._memory)).set_value(memory)
 
     def _corrected_rolling(
         self, rolling: interacting_models.Estimate | tuple[()], measured, std
@@ -167,14 +175,13 @@ class PoseSensor(LeafSystem):
         )
         return interacting_models.correct(means, covariances, chances, measured, std)
 
-    def _pose_of(self, context) -> PoseEstimate | tuple[()]:
-        """The filter's pose at the last reading that has arrived; (): none yet."""
-        return context.get_abstract_state(int(self._pose)).get_value()
+    def _memory_of(self, context) -> _Memory:
+        return context.get_abstract_state(int(self._memory)).get_value()
 
     def _calc(self, i):
         def calc(context, output):
-            pose = self._pose_of(context)
-            if not pose:
+            pose = self._memory_of(context).pose
+            if pose is None:
                 output.SetFromVector(self._unknown[i])
                 return
             dt = max(context.get_time() - pose.t, 0.0)
@@ -185,11 +192,13 @@ class PoseSensor(LeafSystem):
 
         return calc
 
+    def _calc_readings(self, context, output):
+        output.set_value(self._memory_of(context).known)
+
     def _calc_reading(self, context, output):
-        known = context.get_abstract_state(int(self._known)).get_value()
+        known = self._memory_of(context).known
         t, p, q = known[-1] if known else (-1.0, np.zeros(3), [1.0, 0.0, 0.0, 0.0])
         output.SetFromVector([t, *p, *q])
 
     def _calc_seen(self, context, output):
-        pose = self._pose_of(context)
-        output.SetFromVector([1.0 if pose else 0.0])
+        output.SetFromVector([float(self._memory_of(context).pose is not None)])

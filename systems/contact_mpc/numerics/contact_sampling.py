@@ -157,6 +157,9 @@ class Round:
     chosen: int
     x: np.ndarray  # (N + 1, n_x) the plan from the chosen one.
 
+    def __deepcopy__(self, memo) -> "Round":
+        return self  # Nothing in it is changed once it is there.
+
 
 def sample_round(
     config: SamplingConfig,
