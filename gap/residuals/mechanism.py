@@ -426,16 +426,18 @@ class MechanismProblem(InverseModel, GapProblem):
         alone = self._left_by_early(given, without=LIKE_EARLY)
         enough = max(NOISE_RMS_MAX, (1.0 + SAME_ERROR) * beside(0.0)[0])
         for left, most in ((beside, np.inf), (alone, enough))[: 1 + (len(given) > 2)]:
+            held, usual = left(0.0)
+            if held <= NOISE_RMS_MAX:
+                continue
             start = min(np.arange(0.0, EARLIEST, 0.5), key=lambda x: left(x)[0])
             best = minimize_scalar(
                 lambda periods: left(periods)[0],  # noqa: B023
                 bounds=(max(start - 0.5, 0.0), start + 0.5), method="bounded",
                 options={"xatol": EARLY_TO},
             )  # fmt: skip
-            (held, usual), (least, then) = left(0.0), left(best.x)
+            least, then = left(best.x)
             gained = len(self.base()) * (held**2 - least**2) / max(least**2, 1.0)
             is_sure = gained > BESIDE_NOISE_EVIDENCE * self.correlation**2
-            is_sure &= held > NOISE_RMS_MAX
             # Not for a few rows alone.
             if is_sure and then < usual and least < most and best.x < LAST:
                 return float(best.x) * self.row_sec()
