@@ -428,12 +428,11 @@ def judge_logs(robot: Robot, logs: Sequence[Log]) -> Judged:
         said += [each for each in more if each not in said]
     servos = _servos_of_efforts(robot, every, logs)
     most: dict[str, float] = {}
-    for log in logs:
-        for name, y in _scaled(log, every[log.path]).items():
-            joint, _, what = name.rpartition(".")
-            if what in ("effort_measured", "effort_command"):
-                own = float(np.nanmax(np.abs(y), initial=0.0))
-                most[joint] = max(own, most.get(joint, 0.0))
+    for name, y in (x for log in logs for x in _scaled(log, every[log.path]).items()):
+        joint, _, what = name.rpartition(".")
+        if what.startswith("effort"):
+            own = float(np.nanmax(np.abs(y), initial=0.0))
+            most[joint] = max(own, most.get(joint, 0.0))
     given = [f"{joint}.effort_measured" for joint in servos]
     every = {path: of_one_drive(matches, given) for path, matches in every.items()}
     return Judged(robot, every, fixed, tuple(unused), tuple(said), servos, most)
@@ -792,8 +791,7 @@ def _actuation(judged: Judged, kinds, logs, notes: list[str]) -> tuple[list[str]
                 )
             joints = [j.name for j in robot.joints if j.name in (*joints, *untold)]
             limits = {j: robot.effort_limits.get(j, np.inf) for j in joints}
-            beyond = _beyond(limits, judged.most)
-            more = _limits(limits, judged.most, notes) if beyond else []
+            more = _limits(limits, judged.most, notes, False)
             keys = ["type: effort", f"joints: [{', '.join(joints)}]", *more]
             return [f"actuation: {{{', '.join(key.strip() for key in keys)}}}"], ""
     joints = named("position_command") or named("velocity_command")
@@ -877,14 +875,10 @@ def _servos_of_file(robot: Robot, joints, drives, notes: list[str]) -> list[str]
     ]
 
 
-def _beyond(limits: Mapping[str, float], most: Mapping[str, float]) -> list[str]:
-    return [j for j, limit in limits.items() if most.get(j, 0.0) > BEYOND * limit]
-
-
-def _limits(limits: Mapping[str, float], most, notes: list[str]) -> list[str]:
+def _limits(limits, most, notes: list[str], every: bool = True) -> list[str]:
     """The line of the drives' limits, without those that efforts are beyond: a world
-    without them was logged."""
-    beyond = _beyond(limits, most)
+    without them was logged. every: also where there are none such."""
+    beyond = [j for j, limit in limits.items() if most.get(j, 0.0) > BEYOND * limit]
     if beyond:
         notes.append(
             f"efforts of {', '.join(beyond)} are beyond the limits of the robot's "
@@ -892,8 +886,8 @@ def _limits(limits: Mapping[str, float], most, notes: list[str]) -> list[str]:
         )
     own = [1e9 if j in beyond or not 0.0 < x < 1e6 else float(x)
            for j, x in limits.items()]  # fmt: skip
-    some = beyond or min(own, default=1e9) < 1e9
-    return [f"  limit: {own}"] if some else []
+    told = beyond or every and min(own, default=1e9) < 1e9
+    return [f"  limit: {own}"] if told else []
 
 
 def _time_step(robot: Robot, actuation: Sequence[str]) -> float:
