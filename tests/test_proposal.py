@@ -13,7 +13,13 @@ from makebreak.gap.data.match import JointName
 from makebreak.gap.data.proposal import of_one_drive, propose
 from makebreak.gap.data.reading import read_recording
 from makebreak.gap.data.robot import propose_scene, read_log, read_robot
-from makebreak.gap.data.servo_gains import ServoGains, _fitted, _fitted_at
+from makebreak.gap.data.servo_gains import (
+    ServoGains,
+    ServoLog,
+    _fitted,
+    _fitted_at,
+    gains_of_efforts,
+)
 from makebreak.gap.simulation.scene_simulation import SceneSimulation
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.scene import load_scene, read_scene
@@ -661,6 +667,20 @@ def test_efforts_that_are_what_a_servo_gives_tell_its_gains(tmp_path, own):
     assert scene.actuation.kp == pytest.approx([kp], rel=0.01)
     assert scene.actuation.kd == pytest.approx([kd], rel=0.05)
     assert '"j_effort": null' in sidecar or "j_effort: null" in sidecar
+
+
+@pytest.mark.parametrize("kp, told", [(80.8, 80.0), (88.0, 88.0)])
+def test_gains_of_the_file_are_taken_where_parts_of_a_law_nearly_cancel(kp, told):
+    """A light joint needs next to nothing of the tens of N m that stiffness and damping
+    give against each other: their size is not in that to a per cent."""
+    t = 0.002 * np.arange(6000)
+    q, v = np.sin(2.0 * t), 2.0 * np.cos(2.0 * t)
+    error = 3.0 / 80.0 * v + 5e-4 * np.sin(5.0 * t)
+    effort = kp * error - 3.0 * v
+    log = ServoLog(t, q[:, None], (q + error)[:, None], effort[:, None])
+    (found,) = gains_of_efforts([log], [(80.0, 3.0)])
+    # Rates averaged over 0.2 s: half a per cent.
+    assert found.kp == pytest.approx(told, rel=5e-3)
 
 
 def test_efforts_that_a_servo_does_not_give_drive_the_joints(tmp_path):

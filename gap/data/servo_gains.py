@@ -25,6 +25,7 @@ PARTS = 5  # Of the data: each is predicted from the others,
 LARGEST_SPREAD = 0.15  # whose stiffnesses differ by less than this share (1 sigma),
 LEAST_EXPLAINED = 0.8  # and of what the rest leaves the stiffness explains this.
 LAW_LEAVES = 0.01  # Of the variance of an effort that is what its servo gives.
+LAW_OFF = 0.03  # Of the gains of a file, which are rather taken than those of a fit.
 
 
 @dataclass(frozen=True)
@@ -117,7 +118,9 @@ def _law(parts: Sequence[tuple[np.ndarray, np.ndarray]], known) -> ServoGains | 
         other = kd * (X[:, 2] - X[:, 1])  # Of so much of its rate the row after.
         rest = y - kp * X[:, 0] - kd * X[:, 1]
         share = np.clip(rest @ other / max(other @ other, 1e-300), 0.0, 1.0)
-        if np.sum((rest - share * other) ** 2) < most:
+        # Where its parts nearly cancel, as at a light joint, no effort tells their size.
+        parted = LAW_OFF**2 * kp**2 * np.sum((X[:, 0] - X[:, 0].mean()) ** 2)
+        if np.sum((rest - share * other) ** 2) < max(most, parted):
             return ServoGains(kp, kd, 0.0, 0.0)
     size = np.maximum(np.sqrt(np.mean(X**2, axis=0)), 1e-12)
     c, left = nnls(X / size, y)
