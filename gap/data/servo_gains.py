@@ -118,7 +118,7 @@ def _law(parts: Sequence[tuple[np.ndarray, np.ndarray]], known) -> ServoGains | 
         other = kd * (X[:, 2] - X[:, 1])  # Of so much of its rate the row after.
         rest = y - kp * X[:, 0] - kd * X[:, 1]
         share = np.clip(rest @ other / max(other @ other, 1e-300), 0.0, 1.0)
-        # Where its parts nearly cancel, as at a light joint, no effort tells their size.
+        # Where its parts nearly cancel, as at a light joint, efforts tell no size.
         parted = LAW_OFF**2 * kp**2 * np.sum((X[:, 0] - X[:, 0].mean()) ** 2)
         if np.sum((rest - share * other) ** 2) < max(most, parted):
             return ServoGains(kp, kd, 0.0, 0.0)
