@@ -76,6 +76,7 @@ HALF = 0.5  # Of a channel's power: what one effect more must explain to be a la
 TRIMS, TRIMMED, TRIM_Z = 8, 0.3, 4.0
 # In rows: how early commands are tried, and may be, and how well that is known.
 EARLIEST, LAST, EARLY_TO = 2.0, 1.9, 0.02
+EARLY_LEFT = 0.25  # Share of what is beyond the noise that they may leave.
 LIKE_EARLY = ("N m s/rad", "kg m2")  # Units of what does the same to slow motions.
 UNWEIGHTED = 10.0  # Times what a push left, as its rows' noise.
 LAGS = 9  # Test functions over which errors may go together (0.9 s).
@@ -424,10 +425,11 @@ class MechanismProblem(InverseModel, GapProblem):
             return 0.0
         beside = self._left_by_early(given)
         alone = self._left_by_early(given, without=LIKE_EARLY)
-        enough = max(NOISE_RMS_MAX, (1.0 + SAME_ERROR) * beside(0.0)[0])
-        for left, most in ((beside, np.inf), (alone, enough))[: 1 + (len(given) > 2)]:
+        enough = max(NOISE_RMS_MAX, beside(0.0)[0])
+        ways = (beside, UNEXPLAINED_RMS, np.inf), (alone, NOISE_RMS_MAX, enough)
+        for left, least_held, most in ways[: 1 + (len(given) > 2)]:
             held, usual = left(0.0)
-            if held <= NOISE_RMS_MAX:
+            if held <= least_held:
                 continue
             start = min(np.arange(0.0, EARLIEST, 0.5), key=lambda x: left(x)[0])
             best = minimize_scalar(
@@ -438,7 +440,8 @@ class MechanismProblem(InverseModel, GapProblem):
             least, then = left(best.x)
             gained = len(self.base()) * (held**2 - least**2) / max(least**2, 1.0)
             is_sure = gained > BESIDE_NOISE_EVIDENCE * self.correlation**2
-            # Not for a few rows alone.
+            # Not for a few rows alone, nor for what damping gains that is in its way.
+            is_sure &= share_left(held, least) <= EARLY_LEFT
             if is_sure and then < usual and least < most and best.x < LAST:
                 return float(best.x) * self.row_sec()
         return 0.0

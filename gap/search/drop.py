@@ -11,6 +11,7 @@ from makebreak.gap.said import called
 from makebreak.gap.search.choice import (
     Choice,
     deviations_off,
+    fixed_parameters,
     is_clearly_off,
     is_significant,
     places,
@@ -37,6 +38,7 @@ def drop_needless(
 ) -> tuple[list[Choice], Fitted]:
     """Without effects whose removal hardly makes the error larger, the least needed
     first."""
+    chosen, current = _less_at_once(search, chosen, current)
     while len(chosen) > 1:
         screen = search.screen(current.r, current.fit.train)
         now = screen.evaluate(current.r)
@@ -85,6 +87,54 @@ def drop_needless(
             chosen = refreshed(chosen, current)
             current = search.refit(chosen, current)
     return chosen, current
+
+
+def _less_at_once(
+    search: Comparison, chosen: list[Choice], current: Fitted
+) -> tuple[list[Choice], Fitted]:
+    """Without all that is needless by columns, one after another; as it is where an
+    exact fit of the rest does not say the same."""
+    problem = search.problem
+    slopes, of = search.slopes(chosen, current)
+    if not slopes.shape[1] or problem.weighed_by(current.effects) is not None:
+        return chosen, current
+    screen = search.screen(current.r, current.fit.train)
+    left = screen.fit_nuisances(current.r)[1]
+    most = search.error(screen.evaluate(current.r).score) / (
+        1.0 - search.plan.least_gain
+    )
+
+    def without(gone: Sequence[int]) -> tuple[float, np.ndarray]:
+        """The error, and what is left (m,)."""
+        r = problem.residual(search.without(current.effects, *gone))
+        others = slopes[:, ~np.isin(of, gone)]
+        wide = search.screen(r, current.fit.train, slopes=others)
+        return search.error(wide.evaluate(r).score), wide.fit_nuisances(r)[1]
+
+    gone: list[int] = []
+    try:
+        alone = [without([k])[0] for k in range(len(chosen))]
+        for k in np.argsort(alone).tolist():
+            error, less = without([*gone, k])
+            if not _stays(search, chosen[k], less, left, error > most):
+                gone.append(k)
+        rest = [c for k, c in enumerate(chosen) if k not in gone]
+        if len(gone) < 2 or not rest:
+            return chosen, current
+        smaller = fit_effects(
+            problem, screen, search.without(current.effects, *gone),
+            fixed_parameters(rest), evaluations=_EVALUATIONS,
+        )  # fmt: skip
+    except ValueError:  # What is left would be no scene.
+        return chosen, current
+    gained = search.error(smaller.score) > most
+    strains = search.is_strained(smaller) and not search.is_strained(current)
+    if strains or any(
+        _stays(search, chosen[k], smaller.left, left, gained) for k in gone
+    ):
+        return chosen, current
+    search.say(f"  without {len(gone)} of {len(chosen)} effects: {smaller.score:.3g}")
+    return rest, smaller
 
 
 def _is_beyond_doubt(
