@@ -76,8 +76,9 @@ class Budget:
         if now >= end:
             raise Stopped
 
-    def share(self, n: int) -> "Budget":
-        """A budget of one of n that come one after another, of what is left."""
+    def share(self, n: float) -> "Budget":
+        """A budget of one of n that come one after another, of what is left; or, where
+        these are of unlike size, of one of which n are as much as all of them."""
         left = self._start + self.seconds - monotonic()
         return Budget(max(left / n, 1e-3), self._is_asked, self._tick)
 

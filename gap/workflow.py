@@ -84,7 +84,7 @@ from makebreak.gap.result import (
     Tried,
     Where,
 )
-from makebreak.gap.said import figure
+from makebreak.gap.said import MANY_ALIKE, figure
 from makebreak.gap.search.choice import Choice, Selection
 from makebreak.gap.search.chosen_by_simulation import (
     above_step,
@@ -228,7 +228,8 @@ def _run(
     def of_limb(k: int) -> GapResult:
         of_scene, of_parts = only(limbs[k], scene, parts)
         of_checks, name = list(checks), f"{limbs[k][0]} and on"
-        with budget.share(1 if jobs > 1 else len(limbs) - k).running() as own:
+        ahead = sum(map(len, limbs[k:])) / len(limbs[k])  # By their joints.
+        with budget.share(1.0 if jobs > 1 else ahead).running() as own:
             try:
                 result = _compared(
                     of_scene, SceneDynamics(of_scene), of_parts, False, of_checks, 1,
@@ -495,7 +496,17 @@ def in_equations_alone(
     """Where a run ended before held-out windows were simulated: nothing is named, as
     nothing is confirmed; what the search would have named is in the sentence."""
     start, end = problem.error(selection.start), problem.error(selection.end)
-    tried = [says_of(effect) for effect in selection.effects()]
+    by_kind: dict[str, list[Effect]] = {}
+    for effect in selection.effects():
+        by_kind.setdefault(effect.kind, []).append(effect)
+    tried = [
+        said
+        for kind, same in by_kind.items()
+        for said in (
+            map(says_of, same) if len(same) < MANY_ALIKE
+            else [f"{kind} at {len(same)} places"]
+        )
+    ]  # fmt: skip
     agrees = start <= AGREEMENT_RMS_MAX and not tried
     words = f"What was fitted is off by {figure(start)} times the noise"
     if tried:

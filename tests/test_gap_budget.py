@@ -292,3 +292,9 @@ def test_a_proposal_is_there_before_anything_is_computed(tmp_path):
     assert (tmp_path / "out/log.yaml").is_file()
     again = ["out/proposed_scene.yaml", "log.csv", "--out", "second"]
     assert command(again, tmp_path, "checking", [(0.0, signal.SIGINT)])[0] == 130
+
+
+def test_a_limb_of_many_joints_has_as_much_more_time():
+    whole, limbs = Budget(290.0), (17, 6, 6)
+    shares = [whole.share(sum(limbs[k:]) / limbs[k]).seconds for k in range(3)]
+    assert shares == pytest.approx([170.0, 145.0, 290.0], abs=1.0)
