@@ -22,7 +22,7 @@ from makebreak.gap.report.interactive import (
     expected_of,
     shown_series,
 )
-from makebreak.gap.report.markup import headline
+from makebreak.gap.report.markup import headline, sentence_html
 from makebreak.gap.report.pictures import picture_of_series, picture_of_where
 from makebreak.gap.report.sections import considered, evidence, series
 from makebreak.gap.report.summary import next_best, summary_lines
@@ -578,3 +578,8 @@ def test_a_long_text_is_no_heading():
         "123456789"
     )
     assert html.endswith("</ul><p>Wait.</p>")
+
+
+def test_a_sentence_that_begins_with_a_name_keeps_it():
+    assert sentence_html("robot.a to robot.b: each.") == "robot.a to robot.b: each."
+    assert sentence_html("each of 4 joints.") == "Each of 4 joints."

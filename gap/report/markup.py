@@ -15,7 +15,9 @@ _LONG = 400  # Characters of a heading.
 
 def sentence_html(sentence: str) -> str:
     """A sentence as HTML: it begins with a capital and has a sign for +-."""
-    text = escape(sentence[:1].upper() + sentence[1:]).replace("+-", "&plusmn;")
+    is_name = "." in sentence.split(" ", 1)[0].rstrip(".:")
+    first = sentence[:1] if is_name else sentence[:1].upper()
+    text = escape(first + sentence[1:]).replace("+-", "&plusmn;")
     for unit in ("N m", "kg m2", "rad/s", "N s/m"):  # A number keeps its unit.
         text = text.replace(f" {unit}", "&nbsp;" + unit.replace(" ", "&nbsp;"))
     return text

@@ -55,14 +55,13 @@ def picture_of_channels(result: GapResult) -> Figure:
     _plain_numbers(axes.xaxis)
     axes.set_yticks(rows, names, fontsize=9)
     axes.invert_yaxis()
-    axes.set_xlabel("held-out error / expected error", fontsize=9)
+    left = len(per_channel) - len(names)
+    more = f" (the largest; {left} more are in result.json)" if left > 0 else ""
+    axes.set_xlabel(f"held-out error / expected error{more}", fontsize=9)
     axes.legend(
         fontsize=8, frameon=False, ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0)
     )
     _plain(axes)
-    left = len(per_channel) - len(names)
-    if left > 0:
-        axes.set_title(f"the largest; {left} more are in result.json", fontsize=8)
     return figure
 
 
