@@ -27,9 +27,8 @@ import yaml
 
 from makebreak.benchmarks import sysid as bench_sysid
 from makebreak.benchmarks.driven_rig import Log, Rig, Values, scales
-from makebreak.benchmarks.gap_benchmark import check
 from makebreak.benchmarks.rows import run_gap
-from makebreak.benchmarks.sysid import make_case, read_robot
+from makebreak.benchmarks.sysid import left_out, make_case, read_robot
 
 CASES = (
     "00_leg3_servo_none", "01_leg3_servo_friction", "09_legs12_servo_friction",
@@ -190,12 +189,8 @@ def rows(cases: Sequence[str] = CASES) -> list[dict]:
     says what is missing. Value: held-out error; known_mrad: that of the rows that the
     tools had."""
     what = "gap, mujoco.sysid and CMA-ES on driven robots"
-    try:
-        check("driven")
-    except ValueError as error:
-        return [{"what": what, "note": f"left out: {error}"}]
-    if not available():
-        return [{"what": what, "note": "left out: pip install 'makebreak[sysid]'"}]
+    if missing := left_out(what, "driven", available()):
+        return missing
     found: list[dict] = []
     with TemporaryDirectory() as folder:
         for name in cases:

@@ -392,19 +392,24 @@ def compare(found: Fit, truth: Mapping) -> tuple[dict[str, float], int, int]:
 
 def rows(cases: Sequence[str] = CASES) -> list[dict]:
     """Two rows for each case, one for each tool; or one that says what is missing."""
-    what = "gap beside mujoco.sysid"
-    try:
-        check("development")
-    except ValueError as error:
-        return [{"what": what, "note": f"left out: {error}"}]
-    if not available():
-        return [{"what": what, "note": "left out: pip install 'makebreak[sysid]'"}]
+    if missing := left_out("gap beside mujoco.sysid", "development", available()):
+        return missing
     found: list[dict] = []
     with TemporaryDirectory() as folder:
         for name in cases:
             case, truth = make_case("development", name, Path(folder))
             found += _rows_of(case, Path(folder) / "out" / name, truth)
     return found
+
+
+def left_out(what: str, which: str, has_tools: bool) -> list[dict]:
+    """A row that says what is missing: a set's maker, or the tools; none: nothing."""
+    note = "" if has_tools else "pip install 'makebreak[sysid]'"
+    try:
+        check(which)
+    except ValueError as error:
+        note = str(error)
+    return [{"what": what, "note": f"left out: {note}"}] if note else []
 
 
 def make_case(which: str, name: str, folder: Path) -> tuple[Path, dict]:

@@ -14,7 +14,7 @@ from makebreak.gap.residuals.mechanism import MechanismProblem
 from makebreak.gap.result import Estimate, Evidence, NamedEffect
 from makebreak.gap.said import said_together
 from makebreak.gap.search.comparison import Comparison
-from makebreak.gap.search.groups import groups_of, of_more_kinds
+from makebreak.gap.search.groups import _needless_member, groups_of, of_more_kinds
 from makebreak.models.effects.kind import Effect
 
 
@@ -136,3 +136,20 @@ def test_what_many_joints_have_is_one_sentence():
         ("t: 0.2.", tied),
     ]  # fmt: skip
     assert [said for said, _ in said_together(more[:3])] == [e.says for e in more[:3]]
+
+
+@pytest.mark.parametrize("least", [{}, {"coulomb": 0.0}])
+def test_a_member_with_an_impossible_value_goes_however_much_it_explains(least):
+    """Less friction than the model has where that has none."""
+    rng = np.random.default_rng(2)
+    channel, train = np.repeat([0, 1], 900), np.arange(1800) // 30 % 3 != 1
+    columns = [np.where(channel == k, rng.normal(size=1800), 0.0) for k in range(2)]
+    left = 0.1 * rng.normal(size=1800) - 0.7 * columns[0] + 0.5 * columns[1]
+    members = [
+        Candidate(KINDS[0], (f"r.j{k}",), 1, (x[:, None],),
+                  (lambda c: {"coulomb": float(c[0])},), least=least)
+        for k, x in enumerate(columns)
+    ]  # fmt: skip
+    screen = Screen(left, np.zeros((1800, 0)), np.zeros(0), train)
+    gone = _needless_member(search_of(left, train, channel), screen, members)
+    assert gone == (0 if least else None)

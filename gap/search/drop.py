@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from makebreak.gap.fit import fit_effects
-from makebreak.gap.problem import Candidate, Fitted, is_sane
+from makebreak.gap.problem import Candidate, Fitted, GapProblem, is_sane
 from makebreak.gap.said import called
 from makebreak.gap.search.choice import (
     Choice,
@@ -61,9 +61,9 @@ def drop_needless(
             words = f"  without {called(chosen[k].effect)}"
             try:
                 if slopes.shape[1]:  # By columns, the others free: that is quick.
-                    r, others = problem.residual(rest), slopes[:, of != k]
-                    wide = search.screen(r, current.fit.train, slopes=others)
-                    score, less = wide.evaluate(r).score, wide.fit_nuisances(r)[1]
+                    score, less = _by_columns(
+                        search, problem, current, (slopes, of), [k]
+                    )
                     search.say(f"{words}, by columns: {score:.3g}")
                     if _stays(search, chosen[k], less, left, error(score) > most):
                         continue
@@ -89,6 +89,19 @@ def drop_needless(
     return chosen, current
 
 
+def _by_columns(
+    search: Comparison, problem: GapProblem, current: Fitted,
+    slopes: tuple[np.ndarray, np.ndarray], gone: Sequence[int],
+) -> tuple[float, np.ndarray]:  # fmt: skip
+    """The held-out error of what is chosen but for some of it, all others free to first
+    order, and what is left (m,). slopes: as of Comparison.slopes."""
+    columns, of = slopes
+    r = problem.residual(search.without(current.effects, *gone))
+    others = columns[:, ~np.isin(of, gone)]
+    wide = search.screen(r, current.fit.train, slopes=others)
+    return wide.evaluate(r).score, wide.fit_nuisances(r)[1]
+
+
 def _less_at_once(
     search: Comparison, chosen: list[Choice], current: Fitted
 ) -> tuple[list[Choice], Fitted]:
@@ -105,11 +118,8 @@ def _less_at_once(
     )
 
     def without(gone: Sequence[int]) -> tuple[float, np.ndarray]:
-        """The error, and what is left (m,)."""
-        r = problem.residual(search.without(current.effects, *gone))
-        others = slopes[:, ~np.isin(of, gone)]
-        wide = search.screen(r, current.fit.train, slopes=others)
-        return search.error(wide.evaluate(r).score), wide.fit_nuisances(r)[1]
+        score, less = _by_columns(search, problem, current, (slopes, of), gone)
+        return search.error(score), less
 
     gone: list[int] = []
     try:
