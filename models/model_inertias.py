@@ -3,6 +3,7 @@
 What moves together counts together: a light dummy link, or a camera's, that is fixed to
 a trunk may have any numbers, if those of the whole are a body's. So its moments are
 counted with the link that it is fixed to. What is fixed to the world counts nowhere.
+Moments that are a body's but for less than they are ever known to are taken as such.
 """
 
 from collections.abc import Callable
@@ -22,6 +23,7 @@ from makebreak.models.effects.model_text import (
 
 ROUNDING = 1e-9  # Of the largest moment.
 NOTHING = 1e-15  # [kg m2] A gram at a micrometre: less is rounding, too.
+KNOWN_TO = 0.05  # Of the largest moment: CAD models without cables and grease.
 LEAST = 1e-3  # Of the largest part of a repaired inertia: no rounding undoes it.
 
 
@@ -92,7 +94,16 @@ def mended(
                         f"{heavy.name()}, which it is fixed to"
                     )
                     moved = True
-            if not moved:
+            near = nearest_physical(inertial.central)
+            off = np.abs(near - inertial.central).max()
+            largest = np.abs(inertial.central).max()
+            if not moved and inertial.mass > 0.0 and off < KNOWN_TO * largest:
+                write_inertial(links[name], replace(inertial, central=near))
+                notes.append(
+                    f"link {name} {fault}; taken as {_moments(near)}, which is "
+                    f"{off / largest:.1%} of the largest off"
+                )
+            elif not moved:
                 defects.append(f"link {name!r} {fault}")
         if defects:
             raise ValueError(
@@ -167,9 +178,12 @@ def repaired(text: str) -> tuple[str, list[str]]:
         if inertial.mass == 0.0:
             central = np.zeros((3, 3))
         write_inertial(links[name], replace(inertial, central=central))
-        moments = ", ".join(f"{x:g}" for x in np.linalg.eigvalsh(central))
-        changed.append(f"link {name!r} {fault}; proposed: {moments}")
+        changed.append(f"link {name!r} {fault}; proposed: {_moments(central)}")
     return document.toxml(), changed
+
+
+def _moments(central: np.ndarray) -> str:
+    return ", ".join(f"{x:g}" for x in np.linalg.eigvalsh(central))
 
 
 def _parsed(text: str) -> minidom.Document:

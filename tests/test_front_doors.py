@@ -7,6 +7,7 @@ from io import BytesIO
 
 import numpy as np
 import pytest
+import yaml
 from front_doors import KINDS, ROBOTS, exact, one
 
 from makebreak.gap.data.content import Reading, check_contents, likeness
@@ -487,3 +488,24 @@ def test_efforts_are_in_the_unit_that_most_of_them_are_in(tmp_path):
     for k in (1, 2, 3):
         line = f"joint{k}_effort: {{channel: arm.joint{k}.effort_measured, scale: 0.001"
         assert line in text
+
+
+def test_gears_that_differ_are_not_taken_from_the_joint_that_tells_best(tmp_path):
+    """As of a mobile manipulator's currents: one joint tells its factor well, another
+    one less well, and of the other sign, and the third hardly moves its own."""
+    path, log = exact("three", tmp_path, np.random.default_rng(4))
+    columns = {"time": log.time} | log.columns
+    noise = np.random.default_rng(1).normal(size=len(log.time))
+    slow = np.cumsum(noise)  # What the model has not.
+    tau = columns["joint3_effort"]
+    columns["joint3_effort"] = (tau + 0.4 * np.std(tau) * slow / np.std(slow)) / 9.0
+    columns["joint2_effort"] = columns["joint2_effort"] / -6.0
+    columns["joint1_effort"] = 1e-3 * noise
+    read = read_log(csv(tmp_path / "log.csv", columns))
+    proposal = propose_scene(read_robot(path), [read])
+    own = yaml.safe_load(proposal.sidecars[read.path])["columns"]
+    assert own["joint2_effort"]["scale"] == -6.0
+    assert own["joint3_effort"]["scale"] == pytest.approx(9.0, rel=0.2)
+    assert own["joint1_effort"] == "arm.joint1.effort_measured"
+    says = {each.kind: each.says for each in proposal.said}
+    assert "joint1_effort: in a unit of its own" in says["effort_unsure"]

@@ -130,3 +130,29 @@ def test_servo_gains_are_those_of_commands_in_one_file(tmp_path):
     one, two = (gains(robot, tmp_path / name) for name in ("one", "two"))
     np.testing.assert_allclose(one[:2], 80.0, rtol=0.1)
     np.testing.assert_allclose(two, one, rtol=0.1)
+
+
+def test_rows_without_a_time_are_spaced_by_the_rate_that_a_sidecar_says(
+    tmp_path, capsys
+):
+    """Positions and efforts in files of their own, each without a time."""
+    (tmp_path / "log").mkdir()
+    files = [tmp_path / "log" / name for name in ("positions.csv", "efforts.csv")]
+    path, log = exact("three", tmp_path, np.random.default_rng(3))
+    robot = read_robot(path)
+    for file, what in zip(files, ("position", "effort"), strict=True):
+        own = {f"joint{i}": log.columns[f"joint{i}_{what}"] for i in (1, 2, 3)}
+        csv_of(file, own)
+    assert main(["gap", str(path), *map(str, files), "--out", str(tmp_path / "o")]) == 2
+    assert "rate_hz: 100" in capsys.readouterr().err
+    (tmp_path / "log" / "positions.yaml").write_text("rate_hz: 100\n")
+    recording, notes = proposed(robot, tmp_path)
+    assert "efforts.csv is joined to positions.csv row by row: one log" in notes
+    np.testing.assert_allclose(recording.time, 0.01 * np.arange(len(log.time)))
+    for i in (1, 2, 3):
+        for what, ours in (("position", "position"), ("effort", "effort_measured")):
+            logged = log.columns[f"joint{i}_{what}"]
+            np.testing.assert_allclose(recording[f"arm.joint{i}.{ours}"], logged)
+    (tmp_path / "log" / "positions.yaml").write_text("rate_hz: 0\n")
+    with pytest.raises(ValueError, match="rate_hz is 0, expected rows per second"):
+        proposed(robot, tmp_path)

@@ -141,6 +141,18 @@ def test_an_inertia_that_no_body_has_is_refused_by_its_link(
     assert not caplog.records  # Drake's own words would come by the dozen.
 
 
+def test_an_inertia_that_is_nearly_a_bodys_is_taken_as_the_nearest_one(tmp_path, caplog):
+    robot(tmp_path, INERTIAL.format(mass=1, i=0.01, izz=0.0205))
+    (tmp_path / "scene.yaml").write_text(SCENE)
+    plant = load_scene(tmp_path / "scene.yaml", DiagramBuilder()).plant
+    inertia = plant.GetBodyByName("l1").default_spatial_inertia()
+    central = inertia.Shift(inertia.get_com()).CalcRotationalInertia()
+    moments = central.CalcPrincipalMomentsOfInertia()
+    assert inertia.IsPhysicallyValid()
+    np.testing.assert_allclose(moments, [0.01, 0.01, 0.0205], rtol=0.05)
+    assert "1.3% of the largest off" in caplog.text  # 0.00025 + 1e-5 of 0.0205.
+
+
 def test_a_wrong_attribute_of_the_model_is_drakes_line(tmp_path):
     robot(tmp_path, SOLID.replace("0 0 -0.3", "0 inf0 -0.3"))
     assert "scene's directives: Expected 3 values" in refused(tmp_path, SCENE)

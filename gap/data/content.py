@@ -73,6 +73,10 @@ _UNSURE = (
     "larger than the model needs, several times, and no rotor would do: another unit, "
     "or a load or a spring that the model lacks; taken as it is"
 )
+_UNTOLD = (
+    "in a unit of its own, as those of other joints are, which the motion does not "
+    "tell; taken as it is"
+)
 _OTHER_SIGN = (
     "of the other sign than the model needs (or its position and velocity are)"
 )
@@ -858,8 +862,12 @@ def _with_factors(contents: Contents, matches, said) -> list[Match]:
             clear = x.explained < EXPLAINS and told.left < 1.0 - EXPLAINS
             clear &= told.other > CLEARER * told.left and told.rubs > NOTHING
             if clear and told.factor * out[k].scale * own[0] < 0.0:
-                words = "; ".join(filter(None, (own[1], _OTHER_SIGN)))
-                factors[i] = (-own[0], words)
+                factors[i] = (-own[0], own[1])
+        factors = {
+            i: (factor, ", and ".join(filter(None, (word, sign))))
+            for i, (factor, word) in factors.items()
+            if (sign := _OTHER_SIGN if factor < 0.0 else "") or word
+        }
         for i, (factor, word) in factors.items():
             k, _ = found[i]
             m = out[k]
@@ -966,6 +974,20 @@ def _factors(
         }  # fmt: skip
         middle, within = _one_factor(list(known.values()))
         alike = within > 0.0 and (len(known) > 1 or abs(middle) > GAINS[1])
+    hints = {
+        i: x for i, (_, x) in found.items()
+        if i not in known and x.explained > NOTHING and SIGMAS * x.std < abs(x.factor)
+    }  # fmt: skip
+    if (
+        alike
+        and not GAINS[0] < middle < GAINS[1]
+        and any(
+            abs(x.factor - middle) > max(ALIKE * abs(middle), SIGMAS * x.std)
+            for x in hints.values()
+        )
+    ):  # Of each joint its own, as far as it tells.
+        own = {i: _in_words(x.factor, x.std) for i, x in (known | hints).items()}
+        return {i: own.get(i, (1.0, _UNTOLD)) for i in found}
     odd = {i: x.factor for i, x in known.items() if _is_odd(x)}
     if not odd:
         return {}
@@ -1030,10 +1052,10 @@ def _not_a_rotor(contents: Contents, name: str, i: int, factor: float) -> bool:
 
 
 def _in_words(factor: float, std: float) -> tuple[float, str]:
-    """A factor, as round as it may be, and what it looks like."""
+    """A factor, as round as it may be, and what its size looks like."""
     size, sign = abs(factor), float(np.sign(factor))
     if GAINS[0] < size < GAINS[1]:
-        return sign, _OTHER_SIGN
+        return sign, ""
     word = ""
     for unit, name in _UNITS:
         if abs(size / unit - 1.0) < ALIKE:
@@ -1045,7 +1067,7 @@ def _in_words(factor: float, std: float) -> tuple[float, str]:
             f"{ratio:.3g} times {'smaller' if size > 1.0 else 'larger'} than the model "
             "needs, as on the motor's side of a gear, in amperes or in another unit"
         )
-    return sign * size, word + (f", and {_OTHER_SIGN}" if sign < 0.0 else "")
+    return sign * size, word
 
 
 def _round(x: float, within: float) -> float:

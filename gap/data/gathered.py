@@ -33,10 +33,11 @@ def gathered(logs: Sequence[Log], robot: Robot) -> list[Log]:
     whole: list[Log] = []
     for log in sorted(logs, key=lambda log: -_positions(log, robot)):
         fits = [k for k, one in enumerate(whole) if _tell_apart(one, log, robot)]
-        near = [k for k in fits if _common_share(whole[k], log) > _SHARE]
+        near = [k for k in fits if _common_share(whole[k], log) > _SHARE
+                or _has_its_rows(whole[k], log)]  # fmt: skip
         if near:
             whole[near[0]] = _together(whole[near[0]], log)
-        elif fits and not _positions(log, robot):
+        elif fits and not _positions(log, robot) and _is_timed(whole[fits[0]]):
             first = whole[fits[0]]
             raise ValueError(
                 f"recording {log.path} has no position of a joint and no clock in "
@@ -58,7 +59,8 @@ def _channels(log: Log, robot: Robot, prefix: str = "") -> list[str]:
             f"{prefix}{n}": to for n, to in (own.get("columns") or {}).items()
         }
     matches = matches_of(replace(log, table=table, own=own), robot)
-    return [m.channel for m in matches if m.channel and "." in m.channel]
+    found = (m.channel or m.may for m in matches)
+    return [channel for channel in found if channel and "." in channel]
 
 
 def _prefix(log: Log) -> str:
@@ -90,6 +92,18 @@ def _span(log: Log) -> tuple[float, float]:
     return float(np.nanmin(time)), float(np.nanmax(time))
 
 
+def _has_its_rows(one: Log, other: Log) -> bool:
+    """Whether a file without a time has as many rows as one that has it."""
+    return (
+        _is_timed(one) and not _is_timed(other)
+        and len(one.table.row) == len(other.table.row)
+    )  # fmt: skip
+
+
+def _is_timed(log: Log) -> bool:
+    return bool(np.isfinite(_span(log)).all())
+
+
 def _shown(log: Log) -> str:
     return "{:.10g} to {:.10g} s".format(*_span(log))
 
@@ -113,7 +127,8 @@ def _together(one: Log, other: Log) -> Log:
     more = one.own.get("join") or []
     files = [more] if isinstance(more, str) else list(more)
     own = {**one.own, "columns": said, "join": [*files, str(other.path.resolve())]}
-    says = f"{other.path.name} is joined to {one.path.name} by their times: one log"
+    by = "row by row" if _has_its_rows(one, other) else "by their times"
+    says = f"{other.path.name} is joined to {one.path.name} {by}: one log"
     notes = (*one.sidecar.notes, *other.sidecar.notes, says)
     sidecar = replace(one.sidecar, sections=own, is_own=False, notes=notes)
     return replace(one, table=table, text=text, own=own, sidecar=sidecar)

@@ -48,6 +48,9 @@ def read_joined(
             notes = (*table.notes, ("stamps_of_two_columns", says))
             table = replace(table, columns=columns, notes=notes)
         found = find_time(table.columns)
+        if found is None and (rate := sidecar.get("rate_hz")):
+            columns = {"time": (table.row - 1) / rate, **table.columns}
+            table = replace(table, columns=columns)
         if found is not None and is_backward(table.columns[found.column]):
             says = f"{file.name}: the newest row comes first; they are turned round"
             table = replace(
@@ -80,7 +83,8 @@ def joined(
 
     Args: others: files beside `path` and their tables; a name that is taken already is
         `<file>:<name>` in the result. time: the stamps' column, of one clock in all
-        of them; where a file has no such column, the one that looks like a time.
+        of them; where a file has no such column, the one that looks like a time, or
+        that of `path` where it has as many rows.
     Raises: ValueError where a file lacks it, or its time starts again.
     """
     known = [time] if time in table.columns else table.columns
@@ -91,11 +95,14 @@ def joined(
         own = dict(each.columns)
         if time not in own:
             found = find_time(own)
-            if found is None:
+            if found is not None:
+                own = {time: own.pop(found.column) * (found.scale / unit), **own}
+            elif time in table.columns and len(each.row) == len(table.row):
+                own = {time: table.columns[time], **own}
+            else:
                 raise ValueError(
                     f"recording {file} needs the column {time} to be joined"
                 )
-            own = {time: own.pop(found.column) * (found.scale / unit), **own}
         own, row, more = mended(file.name, own, each.row, time)
         if "episode" in own:
             raise ValueError(

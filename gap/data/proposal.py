@@ -25,7 +25,7 @@ _COMMAND = set(
 )
 _WORDS = {
     "acceleration": set("acc acceleration accelerations ddq qdd accel".split()),
-    "current": set("current currents amp amps ampere".split()),
+    "current": set("current currents curr amp amps ampere".split()),
     "effort": set(
         "effort efforts eff torque torques tau trq moment moments u ctrl".split()
     ),

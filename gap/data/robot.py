@@ -537,7 +537,8 @@ def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
             says = f" ({', '.join(named)}: {_STEPS})" if named else ""
             raise ValueError(
                 f"recording {path}: no column looks like a time{says}; name it in "
-                f"{stem_of(path)}.yaml: columns: {{NAME: time}}"
+                f"{stem_of(path)}.yaml: columns: {{NAME: time}}, or say there how many "
+                "rows a second has: rate_hz: 100"
             )
         if not any(c.endswith(".position") for c in channels):
             shown = ", ".join(m.column for m in matches[:8])
@@ -945,7 +946,7 @@ def _motions(robot: Robot, every, logs) -> list[ServoLog]:
     motions = []
     for log in logs:
         channels = _scaled(log, every[log.path])
-        if not all(f"{j.name}.position" in channels for j in robot.joints):
+        if not {"time", *(f"{j.name}.position" for j in robot.joints)} <= {*channels}:
             continue
         time = channels["time"]
         q = np.stack([channels[f"{j.name}.position"] for j in robot.joints], axis=1)

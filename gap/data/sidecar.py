@@ -16,9 +16,10 @@ from makebreak.gap.data.table import stem_of
 
 _SECTIONS = (
     "noise", "filters", "columns", "wrench", "ignore", "join", "provenance",
-    "calibration",
+    "calibration", "rate_hz",
 )  # fmt: skip
 _OF_ONE_LOG = ("ignore", "join", "provenance")
+_AS_WRITTEN = ("provenance", "rate_hz")
 
 
 def sidecar_of(path: Path) -> Path:
@@ -180,7 +181,7 @@ def read_sidecars(path: Path, given: Path | None) -> dict:
             elif key in ("join", "calibration"):
                 value = _files_of(file, key, value)
                 value = value if key == "join" else value[0]
-            elif key != "provenance" and value is not None:
+            elif key not in _AS_WRITTEN and value is not None:
                 if not isinstance(value, dict):
                     raise ValueError(f"{file}: {key} must be names with values")
                 value = {str(k): v for k, v in value.items()}
@@ -191,6 +192,11 @@ def read_sidecars(path: Path, given: Path | None) -> dict:
         for key, value in (data.get("noise") or {}).items():
             number = _finite_number(f"{file}: noise of {key}", value, least=0.0)
             merged["noise"][str(key)] = number
+        if "rate_hz" in data:
+            rate = _finite_number(f"{file}: rate_hz", data["rate_hz"], least=0.0)
+            if rate == 0.0:
+                raise ValueError(f"{file}: rate_hz is 0, expected rows per second")
+            merged["rate_hz"] = rate
         if file in own:  # It speaks of this recording alone.
             merged["own"] = {str(key) for key in data.get("noise") or {}} | {
                 str(key) for key in data.get("filters") or {}
