@@ -141,7 +141,9 @@ def test_an_inertia_that_no_body_has_is_refused_by_its_link(
     assert not caplog.records  # Drake's own words would come by the dozen.
 
 
-def test_an_inertia_that_is_nearly_a_bodys_is_taken_as_the_nearest_one(tmp_path, caplog):
+def test_an_inertia_that_is_nearly_a_bodys_is_taken_as_the_nearest_one(
+    tmp_path, caplog
+):
     robot(tmp_path, INERTIAL.format(mass=1, i=0.01, izz=0.0205))
     (tmp_path / "scene.yaml").write_text(SCENE)
     plant = load_scene(tmp_path / "scene.yaml", DiagramBuilder()).plant
