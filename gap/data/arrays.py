@@ -1,4 +1,4 @@
-"""Dictionaries of arrays as one table: .npz, MATLAB's .mat, lines of JSON.
+"""Dictionaries of arrays as one table: .npz, .npy, MATLAB's .mat, lines of JSON.
 
 What has a row for each instant is a column, whichever way round it lies; a number such
 as `dt` or `frequency` gives the time where no column does; a list of joints' names
@@ -28,10 +28,14 @@ _PERIOD = re.compile(r"(\w*(time|step|control|sim|sample)_?)?(dt|period)|time_?s
                      r"sampl(e|ing)_?time|ts")  # fmt: skip
 _RATE = re.compile(r"\w*(frequency|freq|hz|fs)|\w*(sampl(e|ing)|control|log)_?rate")
 _OF_A_BODY = set("quat quaternion root base imu pose foot feet contact".split())
-_PICKLES = (".pt", ".pth", ".pkl", ".pickle", ".joblib", ".npy")
+_PICKLES = (".pt", ".pth", ".pkl", ".pickle", ".joblib")
+_PICKLED = (
+    "it holds pickled objects, which can run code when they are read: save its arrays "
+    "as npz, as in np.savez('log.npz', **{k: np.asarray(v) for k, v in log.items()})"
+)
 _HDF5 = (".h5", ".hdf5", ".hdf")
 _LINES = (".jsonl", ".ndjson")
-ARRAYS = (".npz", ".mat", *_LINES)
+ARRAYS = (".npz", ".npy", ".mat", *_LINES)
 
 Read = tuple[dict[str, np.ndarray], np.ndarray, int, list[tuple[str, str]]]
 
@@ -45,11 +49,7 @@ def words_of(name: str) -> list[str]:
 def why_not(suffix: str) -> str:
     """What to do with a file of another format; "" if there is nothing to say."""
     if suffix in _PICKLES:
-        return (
-            "it holds pickled objects, which can run code when they are read: save its "
-            "arrays as npz, as in np.savez('log.npz', **{k: np.asarray(v) for k, v in "
-            "log.items()})"
-        )
+        return _PICKLED
     if suffix in _HDF5:
         return "HDF5 is not read: save its arrays with np.savez('log.npz', time=..., )"
     return ""
@@ -109,6 +109,21 @@ def read_npz(path: Path, most_cells: int, unused: frozenset[str]) -> Read:
         raise ValueError(f"recording {path} is no npz of numbers: {error}") from None
 
 
+def read_npy(path: Path, most_cells: int, unused: frozenset[str]) -> Read:
+    """The same of one array: of records, or of numbers without names.
+
+    Raises: ValueError, one line.
+    """
+    try:
+        value = np.load(path, allow_pickle=False)
+    except (OSError, EOFError, ValueError, SyntaxError, MemoryError) as error:
+        why = _PICKLED if "pickle" in str(error) else " ".join(str(error).split())[:100]
+        raise ValueError(f"recording {path} cannot be read: {why}") from None
+    names = value.dtype.names or ("column",)
+    fields = {n: value[n] if value.dtype.names else value for n in names}
+    return _table(path, [n for n in names if n not in unused], fields.get, most_cells)
+
+
 def read_mat(path: Path, most_cells: int, unused: frozenset[str]) -> Read:
     """The same of a MATLAB file of version 4 to 7.2; a struct's fields are
     <struct>/<field>.
@@ -161,7 +176,10 @@ def read_lines(path: Path, most_cells: int, unused: frozenset[str]) -> Read:
     return _table(path, names, load, most_cells)
 
 
-READERS = {".npz": read_npz, ".mat": read_mat, **dict.fromkeys(_LINES, read_lines)}
+READERS = {
+    ".npz": read_npz, ".npy": read_npy, ".mat": read_mat,
+    **dict.fromkeys(_LINES, read_lines),
+}  # fmt: skip
 
 
 def _leaves(name: str, value) -> Iterator[tuple[str, object]]:
@@ -223,13 +241,16 @@ def _table(path: Path, names: Sequence[str], load: Callable, most_cells: int) ->
     row = np.concatenate([np.arange(a, b) for a, b in kept])
     columns: dict[str, np.ndarray] = {}
     for name, shape in shapes.items():
-        if not _width(shape, n):
+        m = n if _width(shape, n) else n - 1  # Inputs between states are one fewer.
+        if not _width(shape, m):
             lost.append(f"{name} {shape}")
             continue
         value = np.squeeze(np.asarray(load(name)))
         if value.dtype.kind == "M":
             value = value.astype("datetime64[ns]").astype(np.int64) * 1e-9
-        value = (value if shape[0] == n else value.T)[row].astype(float)
+        value = value if shape[0] == m else value.T
+        value = value[np.minimum(row, m - 1)].astype(float)
+        value[row >= m] = np.nan
         if value.ndim == 1:
             columns[name] = value
             continue

@@ -20,6 +20,7 @@ from makebreak.gap.data.base_pose import BasePose, base_pose
 from makebreak.gap.data.content import (
     CLEARER,
     EXPLAINS,
+    NOTHING,
     WITHOUT_WEIGHT,
     Contents,
     Said,
@@ -37,6 +38,7 @@ from makebreak.gap.data.findings import (
 )
 from makebreak.gap.data.joined import read_joined
 from makebreak.gap.data.match import AS_SAID, JointName, Match
+from makebreak.gap.data.nameless import layouts
 from makebreak.gap.data.own_contacts import overlapping
 from makebreak.gap.data.proposal import (
     CURRENT,
@@ -59,7 +61,7 @@ from makebreak.gap.data.table import (
     is_channel,
     stem_of,
 )
-from makebreak.gap.data.units import DEG, FULL_RANGE, said_of_units
+from makebreak.gap.data.units import DEG, FULL_RANGE, in_units, said_of_units
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.joints import ROTOR
 from makebreak.models.effects.kind import actuator_of, one_dof_joints
@@ -291,7 +293,7 @@ def matches_of(log: Log, robot: Robot | None) -> list[Match]:
 
 
 _STEPS = "it does not increase from row to row, as of too few digits"
-BASE_MOVES = "base_moves"
+BASE_MOVES, UNNAMED = "base_moves", "columns_unnamed"
 NO_ACTUATION = ["actuation: {type: none}"]
 FROM_SAG = "from how far joints sag below their commands"
 FROM_MOTION = "from how joints followed their commands"
@@ -394,7 +396,7 @@ def judge_logs(robot: Robot, logs: Sequence[Log]) -> Judged:
     """Raises: ValueError for coupled joints that carry others."""
     said: list[Said] = []
     robot = _numbered(robot, logs, said)
-    every = {log.path: matches_of(log, robot) for log in logs}
+    every = {log.path: _named(log, robot, said) for log in logs}
     pose = (
         base_pose([_unsaid(log) for log in logs], robot.bases) if robot.bases else None
     )
@@ -486,6 +488,27 @@ def _numbered(robot: Robot, logs: Sequence[Log], said: list[Said]) -> Robot:
     says = f"By what is in them, columns without names are counted {word}."
     said.append(Said("columns_mixed", robot.joints[0].name, len(robot.joints), says))
     return others[word]
+
+
+def _named(log: Log, robot: Robot, said: list[Said]) -> list[Match]:
+    """matches_of, of a table without names by what is in its columns."""
+    matches, columns = matches_of(log, robot), log.table.columns
+    tried = []
+    for first, own in layouts(columns, matches, robot.joints):
+        by_column = {m.column: m for m in own}
+        own = [*in_units(columns, robot.joints, by_column, log.ranges).values()]
+        left = left_by(robot.plant, robot.joints, columns, own)
+        tried.append((left if left < np.log(NOTHING) else 0.0, first, own))
+    left, first, best = min(tried, key=lambda each: each[0], default=(0.0, {}, []))
+    if left == 0.0 and "velocity" not in first:
+        return matches
+    shown = ", ".join(f"{what} ({column} and on)" for what, column in first.items())
+    says = f"{log.path.name} names no columns. By what is in them they are {shown}."
+    if also := [other["effort_measured"] for share, other, own in tried
+                if share < 0.0 and own is not best]:  # fmt: skip
+        says += f" What begins with {', '.join(also)} could be the efforts as well."
+    said.append(Said(UNNAMED, robot.joints[0].name, float(len(first)), says))
+    return best
 
 
 def _maybe_of_a_range(logs: Sequence[Log], every) -> list[Said]:

@@ -52,7 +52,7 @@ WRENCH = "fx fy fz tx ty tz".split()
 QUANTITIES = frozenset([*JOINT_QUANTITIES, *POSE, *TWIST, *WRENCH])
 _TEXTS = (".csv", ".txt", ".tsv", ".dat")
 FORMATS = (".csv", ".npz", ".parquet")  # In which tables are written.
-_READ = ".csv, .txt, .tsv, .dat (.gz), .npz, .mat, .jsonl, .parquet"
+_READ = ".csv, .txt, .tsv, .dat (.gz), .npz, .npy, .mat, .jsonl, .parquet"
 
 # More numbers than this are not kept in memory (320 MB): 3.6 h of 14 channels at
 # 200 Hz. Of a longer table, evenly spread stretches of rows are.
