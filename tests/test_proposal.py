@@ -43,6 +43,8 @@ def channels(columns, joints, text=None):
 @pytest.mark.parametrize(
     "names, expected",
     [
+        (["theta_1", "theta_dot_1", "torque_1", "theta_ddot_1"],
+         ["1.position", "1.velocity", "1.effort_measured", None]),
         (["q1", "dq1", "tau1", "q_d_1"],
          ["1.position", "1.velocity", "1.effort_measured", "1.position_command"]),
         (["actual_q_0", "actual_qd_0", "target_moment_0", "actual_current_0"],
@@ -56,7 +58,7 @@ def channels(columns, joints, text=None):
         (["jointAngle[0]", "jointVelocity[6]", "commandedTorque[3]"],
          ["1.position", "7.velocity", "4.effort_command"]),
     ],
-    ids=["papers", "industrial", "others", "ros", "lerobot", "camel"],
+    ids=["dots", "papers", "industrial", "others", "ros", "lerobot", "camel"],
 )  # fmt: skip
 def test_columns_are_matched_by_their_names(names, expected):
     columns = {"time": T} | sines(names)

@@ -31,7 +31,8 @@ _WORDS = {
     ),
     "force": set("force forces thrust".split()),
     "velocity": set(
-        "velocity velocities vel vels dq qd qdot qvel speed speeds omega velo v".split()
+        "velocity velocities vel vels dq qd qdot qvel speed speeds spd omega velo "
+        "thetadot v".split()
     ),
     "position": set(
         "position positions pos q qpos angle angles theta phi deg rad state states "
@@ -216,6 +217,8 @@ def _quantity(name: str, named: Sequence[JointName]) -> str | None:
         return None
     command = bool(set(words) & _COMMAND)
     kind = next((kind for kind, own in _WORDS.items() if own & set(words)), None)
+    if dots := sum(word in ("dot", "ddot", "dotdot") for word in words):
+        kind = "velocity" if dots == 1 and "dot" in words else "acceleration"
     if kind == "position":  # A joint's own name may be q1, or have a `joint` in it.
         kind = quantity_of_unit(name) or kind
     elif kind is None and named and not command:
