@@ -62,6 +62,7 @@ from makebreak.gap.residuals.command_times import set_command_times
 from makebreak.gap.residuals.contact_problem import ContactProblem
 from makebreak.gap.residuals.driven import DrivenProblem, is_driven
 from makebreak.gap.residuals.impacts import ImpactProblem, runs_against, without_contact
+from makebreak.gap.residuals.inverse import LOOPS
 from makebreak.gap.residuals.late_poses import contact_problem
 from makebreak.gap.residuals.lying_on_faces import point_on_face
 from makebreak.gap.residuals.mechanism import MechanismProblem
@@ -268,8 +269,10 @@ def _compared(
     decided, reported, done = _conditioned(parts, dynamics, is_mechanism and not meets)
     say("preparing motions and windows")
     problem, found = problem_for(scene, decided, dynamics, jobs, meets)
-    as_they_act, told = _commands_of(problem)
+    as_they_act, told, late = _commands_of(problem)
     if as_they_act is not None:
+        loops = {LOOPS: max(scene.tolerance.get(LOOPS, 0.0), late)} if late else {}
+        scene = replace(scene, tolerance={**scene.tolerance, **loops})
         parts = replace(
             parts, decided=as_they_act(parts.decided),
             reported=as_they_act(parts.reported),
@@ -377,16 +380,18 @@ def _conditioned(
 
 def _commands_of(problem: GapProblem):
     """What makes commands (of recordings) what the motion says that they are, None
-    where they are as their rows have them; and what is said of it."""
+    where they are as their rows have them; what is said of it; and to what what drives
+    feed back is known then [s], 0 where that is no other."""
     if isinstance(problem, MechanismProblem):
         if problem.commands_are_samples():
             said = sampled_commands.finding(problem.recordings)
-            return sampled_commands.as_samples, [said]
+            return sampled_commands.as_samples, [said], 0.0
         if early := problem.commands_early():
             first, row = problem.recordings[0], problem.row_sec()
             said = sampled_commands.finding_of_moved(first.name, -early, row)
-            return partial(moved_sooner, early=early), [said]
-    return None, []
+            # Of a simulator's steps all that goes with velocities is half a step off.
+            return partial(moved_sooner, early=early), [said], early
+    return None, [], 0.0
 
 
 def problem_for(

@@ -72,6 +72,22 @@ def test_of_a_command_an_object_or_four_joints_nothing_is_taken(names):
     assert base_pose([columns(QUAT, names)], ["base"]) is None
 
 
+def two_joints(name: str) -> str:
+    """An arm with two joints on a base that nothing holds."""
+    inertial = (
+        '<inertial><mass value="1"/><inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" '
+        'ixz="0" iyz="0"/></inertial>'
+    )
+    links = "".join(f'<link name="l{k}">{inertial}</link>' for k in range(3))
+    joints = "".join(
+        f'<joint name="{name}_{end}" type="revolute"><parent link="l{k}"/>'
+        f'<child link="l{k + 1}"/><axis xyz="{axis}"/><origin xyz="0 0 0.3"/>'
+        '<limit lower="-2" upper="2" effort="50" velocity="9"/></joint>'
+        for k, (end, axis) in enumerate((("Roll", "1 0 0"), ("Pitch", "0 1 0")))
+    )
+    return f'<robot name="arm">{links}{joints}</robot>'
+
+
 def proposal(folder: Path, more):
     path, log = exact("three", folder, np.random.default_rng(3))
     table = {"time": log.time[:N], **{k: y[:N] for k, y in log.columns.items()}, **more}
@@ -93,6 +109,21 @@ def test_a_robot_that_hangs_is_welded_as_it_hangs(tmp_path):
     assert found.notes[0].startswith("base is welded to the world at the pose")
     (sidecar,) = found.sidecars.values()
     assert "base_quat_w: null" in sidecar
+
+
+def test_a_joint_whose_name_ends_in_roll_is_no_base(tmp_path):
+    (tmp_path / "arm.urdf").write_text(two_joints("Left_Shoulder"))
+    swing = {"time": 0.01 * np.arange(N)}
+    for k, end in enumerate(("Roll", "Pitch")):
+        swing[f"log/q/Left_Shoulder_{end}"] = 0.4 * np.sin(
+            0.03 * (k + 1) * np.arange(N)
+        )
+    whole = RecordingTable(swing, np.arange(N) + 1, N)
+    robot = read_robot(tmp_path / "arm.urdf")
+    found = propose_scene(robot, [Log(tmp_path / "log.csv", whole)])
+    assert not found.without and not found.said
+    (sidecar,) = found.sidecars.values()
+    assert "arm.Left_Shoulder_Roll.position" in sidecar
 
 
 def test_a_base_that_moves_is_an_error_and_one_that_is_not_told_is_said(tmp_path):

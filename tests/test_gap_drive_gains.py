@@ -248,7 +248,8 @@ def test_what_is_fed_back_late_is_damping_and_a_rotor_that_are_not_there(tmp_pat
     for fed_back, effect in (
         ("position", Effect("joint_viscous_damping", [JOINTS[i]],
                             {"damping": late * KP[i]})),
-        ("velocity", Effect("rotor_inertia", [JOINTS[i]], {"inertia": late * KD[i]})),
+        ("velocity", Effect("rotor_inertia", [JOINTS[i]],
+                            {"inertia": late * (KD[i] + model._damping[i])})),
     ):  # fmt: skip
         column = columns[
             names.index(f"input_delay of {JOINTS[i]}, loop of its {fed_back}")

@@ -18,6 +18,7 @@ from makebreak.gap.numerics.selection import (
     benjamini_hochberg,
     between_parts,
     boxed_minimum,
+    in_place_of_others,
     is_plausible,
     is_predicted,
     paired,
@@ -1588,3 +1589,18 @@ def test_slopes_of_one_fit_serve_the_next_where_they_hold(bend):
     problem._base = problem._base.copy()  # In other weights.
     again = problem.fitted("a", "b")
     assert problem.asked >= alone.asked and again.effects == pytest.approx(anew.effects)
+
+
+def test_one_cause_stands_in_the_place_of_many_and_none_of_what_undoes_it():
+    rng = np.random.default_rng(0)
+    many = rng.normal(size=(600, 5))
+    one = many.sum(axis=1) + rng.normal(size=600)
+    columns = np.column_stack([one, many])
+    noise = rng.normal(size=600)
+    c, gained = in_place_of_others(columns, 2.0 * one + 3.0 * many[:, 2] + noise, 1.0)
+    np.testing.assert_array_equal(np.flatnonzero(c), [0, 3])
+    np.testing.assert_allclose(c[[0, 3]], [2.0, 3.0], atol=0.2)  # 5 deviations.
+    # Without it 2^2 a row is left, and four more parameters are needed.
+    assert gained == pytest.approx(4.0 * 600, rel=0.2)
+    for r in (3.0 * many[:, 2], -2.0 * one, 2.0 * (one - many.sum(axis=1))):
+        assert in_place_of_others(columns, r + noise, 1.0)[1] <= 0.0

@@ -487,3 +487,56 @@ def test_early_commands_are_not_what_joints_lack_where_all_is_smooth(tmp_path, e
     problem = MechanismProblem(scene, read_recordings([file]))
     # As well as drives' own loops may be late.
     assert problem.commands_early() == pytest.approx(early, abs=5e-3)
+
+
+def stepped(scene, joints, folder, step, implicit):
+    """The log of a simulator's steps (semi-implicit Euler) of servos, at each of them.
+
+    Args: implicit: whether steps are so in what bearings brake.
+    """
+    plant = SceneDynamics(scene).plant
+    context = plant.CreateDefaultContext()
+    braked = np.array([plant.GetJointByName(j.split(".")[1]).default_damping()
+                       for j in joints])  # fmt: skip
+    time, told = goals(len(joints), np.random.default_rng(0))
+    time, told = time[time < 24.0], told[:, time < 24.0]
+    kp, kd = (np.array(getattr(scene.actuation, gain)) for gain in ("kp", "kd"))
+    rows, q, v = [], np.array(told[:, 0]), np.zeros(len(joints))
+    for t in np.arange(0.0, time[-1], step):
+        goal = told[:, np.searchsorted(time, t + 1e-9, "right") - 1]
+        plant.SetPositions(context, q)
+        plant.SetVelocities(context, v)
+        M = plant.CalcMassMatrix(context)
+        rows.append([t, *q, *v, *goal])
+        force = kp * (goal - q) - (kd + braked) * v - plant.CalcBiasTerm(context)
+        force += plant.CalcGravityGeneralizedForces(context)
+        v = v + step * np.linalg.solve(M + implicit * step * np.diag(braked), force)
+        q = q + step * v
+    rows = np.array(rows)
+    n = len(joints)
+    noise = np.random.default_rng(1).normal(size=(len(rows), 2 * n))
+    rows[:, 1 : 1 + 2 * n] += noise * np.repeat([1e-4, 2e-3], n)
+    names = [f"{j}.{what}" for what in ("position", "velocity", "position_command")
+             for j in joints]  # fmt: skip
+    file = folder / "recording.csv"
+    np.savetxt(file, rows, "%.9g", ",", header=",".join(["time", *names]), comments="")
+    return file
+
+
+@pytest.mark.parametrize("implicit", [False, True])
+def test_of_a_simulators_steps_no_rotor_or_delay_is_named(tmp_path, implicit):
+    """Half a step early commands, and half a step late, or early, damping of a bearing:
+    12 negative rotors and 4 late velocities of a Spot, before."""
+    joints = ["d.j1", "d.j2"]
+    servos = ActuationSection("servo", joints=joints, kp=[60.0, 20.0], kd=[0.0, 0.0])
+    scene = with_effects(
+        replace(double(tmp_path), actuation=servos),
+        ("joint_viscous_damping", "d.j1", dict(damping=6.0)),
+        ("joint_viscous_damping", "d.j2", dict(damping=2.0)),
+    )
+    file = stepped(scene, joints, tmp_path, 0.004, implicit)
+    write_scene(scene, tmp_path / "scene.yaml")
+    problem, _ = problem_for(scene, read_recordings([file]), SceneDynamics(scene))
+    assert problem.commands_early() == pytest.approx(0.002, abs=4e-4)
+    result = run_gap(tmp_path / "scene.yaml", [file])
+    assert result.verdict == "no_gap" and not result.effects

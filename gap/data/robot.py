@@ -398,7 +398,9 @@ def judge_logs(robot: Robot, logs: Sequence[Log]) -> Judged:
     robot = _numbered(robot, logs, said)
     every = {log.path: _named(log, robot, said) for log in logs}
     pose = (
-        base_pose([_unsaid(log) for log in logs], robot.bases) if robot.bases else None
+        base_pose([_of_no_joint(log, every[log.path]) for log in logs], robot.bases)
+        if robot.bases
+        else None
     )
     if pose is not None:
         plant = _load(robot.path, robot.bases, pose=pose)
@@ -528,9 +530,14 @@ def _maybe_of_a_range(logs: Sequence[Log], every) -> list[Said]:
     return said
 
 
-def _unsaid(log: Log) -> dict[str, np.ndarray]:
-    """Columns of which the log's sidecar says nothing."""
-    said = log.own.get("columns") or {}
+def _of_no_joint(log: Log, matches: Sequence[Match]) -> dict[str, np.ndarray]:
+    """Columns of which the log's sidecar says nothing, and that do not have the whole
+    name of a joint (Left_Shoulder_Roll is no roll of a base)."""
+    said = set(log.own.get("columns") or {})
+    for m in matches:
+        joint = (m.channel or "").rpartition(".")[0].partition(".")[2]
+        if joint and {*words_of(joint)} <= {*words_of(m.column)}:
+            said.add(m.column)
     return {k: y for k, y in log.table.columns.items() if k not in said}
 
 

@@ -22,6 +22,7 @@ FEWEST_TELL, LEAST_TELL = 6.0, 0.25
 # Two models say other things of a block of time where the squares of their difference
 # are so many times what is left of a row (two deviations); fewest such blocks.
 TOUCHED, FEWEST_TOUCHED = 4.0, 3
+NEW = 1e-6  # Of a column's squares, what no sum of others may have.
 _PENALTIES = 10.0 ** np.arange(-4.0, 2.0)  # Of a ridge, times the number of rows.
 
 
@@ -184,6 +185,50 @@ class Screen:
             c, c_std, b, float(np.sqrt(held + cost)), float(np.sqrt(held)),
             float(np.sqrt(seen)),
         )  # fmt: skip
+
+
+def in_place_of_others(columns, r, scale: float) -> tuple[np.ndarray, float]:
+    """The coefficients (k,) of the few columns (m, k) that explain r (m,) with the
+    first of them, which is not below 0; 0 for the others; and the evidence for the
+    first: how much less these cost than the few that explain r without it. 0 where more
+    are needed with it: then others are there to undo what it does.
+
+    Args: scale: of what is left of a row.
+    """
+    c, with_it = _few(columns, r, scale)
+    d, without = _few(columns * (np.arange(columns.shape[1]) > 0), r, scale)
+    more = np.count_nonzero(c) > np.count_nonzero(d)
+    return c, 0.0 if more else without - with_it
+
+
+def _few(columns, r, scale: float) -> tuple[np.ndarray, float]:
+    """The coefficients (k,) of the few columns (m, k) that explain r (m,), 0 for the
+    others, and their cost: one after another, the most telling first, while each gains
+    more than the logarithm of m, which it costs; the first one not below 0.
+
+    Source: orthogonal matching pursuit (Pati, Rezaiifar, Krishnaprasad, Asilomar 1993),
+    stopped by BIC (Schwarz, Ann. Stat. 6(2), 1978).
+    """
+    size = np.linalg.norm(columns, axis=0)
+    X = columns / np.where(size > 0.0, size, np.inf)
+    left, chosen = np.array(r, float), np.zeros(len(size), bool)
+    each = float(np.log(len(left)))
+    while not chosen.all():
+        own = np.sum(X**2, axis=0)
+        own[chosen | (own < NEW)] = np.inf
+        along = X.T @ left
+        along[0] = max(along[0], 0.0)
+        gained = along**2 / own / scale**2
+        best = int(np.argmax(gained))
+        if not gained[best] > each:
+            break
+        x = X[:, best] / np.sqrt(own[best])
+        left -= x * (x @ left)
+        X = X - np.outer(x, x @ X)
+        chosen[best] = True
+    c = np.zeros(len(size))
+    c[chosen] = np.linalg.lstsq(columns[:, chosen], r, rcond=None)[0]
+    return c, float(left @ left) / scale**2 + each * int(chosen.sum())
 
 
 def _pseudo_inverse(A: np.ndarray) -> np.ndarray:

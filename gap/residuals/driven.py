@@ -31,6 +31,7 @@ from makebreak.gap.residuals.drive_gains import (
     gains_known_to,
     with_moved_gains,
 )
+from makebreak.gap.residuals.inverse import LOOPS
 from makebreak.gap.residuals.mechanism import (
     LESS,
     MISFIT,
@@ -44,6 +45,7 @@ from makebreak.gap.residuals.mechanism_candidates import (
     tolerances,
     values_tried,
 )
+from makebreak.gap.residuals.mechanism_motion import bearings_of
 from makebreak.gap.residuals.objects import unexplained_in_windows
 from makebreak.gap.residuals.where import where_in_windows
 from makebreak.gap.result import Where
@@ -526,13 +528,16 @@ class DrivenProblem(DrivenWindows, GapProblem):
     def _late_loops(self):
         """(name, effect, size) as link_changes, of drives' own loops: a velocity that
         is fed back late adds to a joint what a smaller rotor would take away."""
-        for joint in self.joints:
+        late = float(self.scene.tolerance.get(LOOPS, LOOP_SEC))
+        for joint, damping in zip(
+            self.joints, bearings_of(self.dynamics.plant), strict=True
+        ):
             law = law_of(self.scene.actuation, joint)
-            if law is None or not law.kd > 0.0:
+            if law is None or not law.kd + damping > 0.0:
                 continue
-            more = rotor(joint, float(law.kd) * LOOP_SEC)
+            more = rotor(joint, float(law.kd + damping) * late)
             if self._takes(more.kind, joint):
-                yield f"input_delay of {joint}, loop", more, -LOOP_SEC
+                yield f"input_delay of {joint}, loop", more, -late
 
     def _moved_loops(self, effects, nuisances: Nuisances, b) -> list[Effect]:
         """Drives' loops as the nuisances (n_b,) have them."""

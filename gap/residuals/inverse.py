@@ -33,7 +33,8 @@ from makebreak.models.scene import Scene
 from makebreak.systems.numerics.filters import LowPass, filtered, with_lag
 
 # Loops of drives run at a kilohertz or more: what they hold is late by half a period.
-LOOP_SEC = 2.5e-4
+LOOPS, LOOP_SEC = "loop_sec", 2.5e-4  # Key of a scene's `tolerance`.
+VELOCITIES_LATE = "sensor_delay of velocities, delay"  # A nuisance.
 LEAST_GAIN = 0.05  # That equations are divided by.
 # That are kept in memory; efforts by row are large, and few come again.
 MOST_MOTIONS, MOST_MEANS, MOST_DYNAMICS, MOST_EFFORTS = 40, 1500, 8, 100
@@ -329,29 +330,36 @@ class InverseModel(WhitenedRows):
 
     def filter_timing(self) -> tuple[list[np.ndarray], list[float], list[str]]:
         """Columns (m,) of the residual, standard deviations [s] and names of what is
-        not known of declared filters of velocities: at which instant of a row's period
-        they were computed. Three tolerances are half a period."""
-        columns, prior, names = [], [], []
+        not known of velocities: at which instant of a row's period they were computed,
+        those with a declared filter each by itself, all others together. (Differences
+        of positions are half a row late, a simulator's velocities half a step.) Three
+        tolerances are half a period."""
+        columns, names = [], []
+        filtered_too: list[int] = []
+        others: list[int] = []
         for i, joint in enumerate(self.joints):
-            name = f"{joint}.velocity"
-            if not self.has["velocity"][i] or not any(
-                track.stages[name] for track in self.tracks
-            ):
+            if self.has["velocity"][i]:
+                stages = [track.stages[f"{joint}.velocity"] for track in self.tracks]
+                (filtered_too if any(stages) else others).append(i)
+        for some in (*([i] for i in filtered_too), others):
+            if not some:
                 continue
             parts = []
             for track, white in zip(self.tracks, self._whiteners, strict=True):
                 none = np.zeros((len(track.bumps.centre), len(self.joints)))
-                others = {f"{j}.{what}": none[:, 0] for what, j in self._other_names()}
-                _, _, vd = track.at(i, track.dense)
-                stages = track.stages[name]
-                rate = filtered(stages, track.dense, vd, track.time)
-                there = np.where(np.isfinite(track.samples[name]), rate, np.nan)
-                others[name] = track.mean_over_rows(-there)
-                parts.append(self._stacked(track, white, none, others))
+                rows = {f"{j}.{what}": none[:, 0] for what, j in self._other_names()}
+                for i in some:
+                    name = f"{self.joints[i]}.velocity"
+                    _, _, vd = track.at(i, track.dense)
+                    rate = filtered(track.stages[name], track.dense, vd, track.time)
+                    there = np.where(np.isfinite(track.samples[name]), rate, np.nan)
+                    rows[name] = track.mean_over_rows(-there)
+                parts.append(self._stacked(track, white, none, rows))
             columns.append(np.concatenate(parts))
-            prior.append(min(r.period_sec() for r in self.recordings) / 6.0)
-            names.append(f"sensor_delay of {name}, delay")
-        return columns, prior, names
+            own = f"sensor_delay of {self.joints[some[0]]}.velocity, delay"
+            names.append(VELOCITIES_LATE if some == others else own)
+        row = min(r.period_sec() for r in self.recordings)
+        return columns, [row / 6.0] * len(columns), names
 
     def loop_timing(self) -> tuple[list[np.ndarray], list[float], list[str]]:
         """Columns (m,) of the residual, standard deviations [s] and names of what is
@@ -375,21 +383,43 @@ class InverseModel(WhitenedRows):
                 efforts.append(late)
             columns.append(self.columns_of(efforts)[:, 0])
             names.append("input_delay of all joints, loop")
-        for i, law in enumerate(self.laws):
-            if law is None or not self.commanded[i]:
-                continue
-            for fed_back, gain in (("position", law.kp), ("velocity", law.kd)):
-                if not gain > 0.0:
-                    continue
-                efforts = []
-                for motion in self.motions():
-                    late = np.zeros((*motion.v.shape, 1))
-                    rate = motion.v if fed_back == "position" else motion.vd
-                    late[:, i, 0] = gain * rate[:, i]
-                    efforts.append(late)
-                columns.append(self.columns_of(efforts)[:, 0])
-                names.append(f"input_delay of {self.joints[i]}, loop of its {fed_back}")
-        return columns, [LOOP_SEC] * len(columns), names
+        for i in range(len(self.joints)):
+            kp, kd = self._loop(i)
+            # A simulator's steps have a joint's own damping as early or late.
+            kd += self._damping[i]
+            for fed_back, gain in (("position", kp), ("velocity", kd)):
+                if gain > 0.0:
+                    columns.append(self._fed_back_late(fed_back, {i: gain}))
+                    names.append(loop_name(self.joints[i], fed_back))
+        late = float(self.scene.tolerance.get(LOOPS, LOOP_SEC))
+        return columns, [late] * len(columns), names
+
+    def _loop(self, i: int) -> tuple[float, float]:
+        """Gains of a joint's own loop, of position and velocity."""
+        law = self.laws[i]
+        if law is None or not self.commanded[i]:
+            return 0.0, 0.0
+        return float(law.kp), float(law.kd)
+
+    def late_velocities(self) -> tuple[np.ndarray, np.ndarray]:
+        """(m,) each: what it does per second that all velocities are late that drives
+        act on, and that bearings damp."""
+        drives = {i: self._loop(i)[1] for i in range(len(self.joints))}
+        bearings = dict(enumerate(self._damping))
+        a, b = (self._fed_back_late("velocity", gains) for gains in (drives, bearings))
+        return a, b
+
+    def _fed_back_late(self, what: str, gains: dict[int, float]) -> np.ndarray:
+        """(m,) what it does to the residual, per second, that this is fed back late to
+        joints {index: gain}."""
+        efforts = []
+        for motion in self.motions():
+            late = np.zeros((*motion.v.shape, 1))
+            rate = motion.v if what == "position" else motion.vd
+            for i, gain in gains.items():
+                late[:, i, 0] = gain * rate[:, i]
+            efforts.append(late)
+        return self.columns_of(efforts)[:, 0]
 
     def least(self, kind: str, at: Sequence[str]) -> dict[str, float]:
         """Lower bounds of parameters: what the model allows; and a drive that follows
@@ -408,6 +438,11 @@ class InverseModel(WhitenedRows):
             if len(asked):
                 found["limit"] = max(found.get("limit", 0.0), float(np.median(asked)))
         return found
+
+
+def loop_name(joint: str, fed_back: str) -> str:
+    """Of the nuisance: how late a position or velocity is fed back."""
+    return f"input_delay of {joint}, loop of its {fed_back}"
 
 
 def _adds_up(heavy: Sequence[Effect]) -> bool:

@@ -10,7 +10,7 @@ from scipy.optimize import minimize_scalar
 from makebreak.gap.data.findings import Finding
 from makebreak.gap.data.recording import Recording
 from makebreak.gap.does_not_fit import DoesNotFit
-from makebreak.gap.numerics.selection import Screen, is_predicted
+from makebreak.gap.numerics.selection import Screen, in_place_of_others, is_predicted
 from makebreak.gap.problem import (
     Candidate,
     Fitted,
@@ -24,7 +24,12 @@ from makebreak.gap.problem import (
 )
 from makebreak.gap.residuals.drive_gains import KEY as GAINS
 from makebreak.gap.residuals.drive_gains import gain_name, with_moved_gains
-from makebreak.gap.residuals.inverse import InverseModel
+from makebreak.gap.residuals.inverse import (
+    LOOPS,
+    VELOCITIES_LATE,
+    InverseModel,
+    loop_name,
+)
 from makebreak.gap.residuals.mechanism_candidates import (
     candidates,
     inseparable,
@@ -46,11 +51,13 @@ from makebreak.gap.thresholds import (
     CLOSED_SHARE_MIN,
     NOISE_RMS_MAX,
     SAME_ERROR,
+    SAME_EVIDENCE,
     SIMULATED_RIVAL_GAIN,
     UNEXPLAINED_RMS,
 )
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
+from makebreak.models.effects.joints import ROTOR, rotor
 from makebreak.models.effects.kind import Effect, find_body, sliding_joints
 from makebreak.models.effects.objects import MASS
 from makebreak.models.scene import Scene
@@ -74,10 +81,7 @@ HALF = 0.5  # Of a channel's power: what one effect more must explain to be a la
 # A rich model is fitted without what it leaves more than TRIM_Z of beside the usual, at
 # most such a share of all, until that stays the same.
 TRIMS, TRIMMED, TRIM_Z = 8, 0.3, 4.0
-# In rows: how early commands are tried, and may be, and how well that is known.
-EARLIEST, LAST, EARLY_TO = 2.0, 1.9, 0.02
-EARLY_LEFT = 0.25  # Share of what is beyond the noise that they may leave.
-LIKE_EARLY = ("N m s/rad", "kg m2")  # Units of what does the same to slow motions.
+LAST = 1.9  # In rows: how early commands may be.
 UNWEIGHTED = 10.0  # Times what a push left, as its rows' noise.
 LAGS = 9  # Test functions over which errors may go together (0.9 s).
 OVERLAP = 1.3  # What neighbouring test functions share of white noise.
@@ -416,58 +420,82 @@ class MechanismProblem(InverseModel, GapProblem):
         """By how much earlier than their rows, less than two of these, drives have
         their position and velocity commands [s]: what a command does to a position
         comes half a step early from a simulator's steps, and one step more where rows
-        were written after the step. 0 where that is not certain, beside whatever joints
-        may lack or, of three joints and more, if it explains as much as what does the
-        same to smooth motions."""
+        were written after the step. 0 where that is not needed beyond doubt by the few
+        effects that explain the motion with it."""
         told = zip(self.joints, self.laws, self.commanded, strict=True)
         given = [j for j, law, has in told if law is not None and has]
         if not given:
             return 0.0
-        beside = self._left_by_early(given)
-        alone = self._left_by_early(given, without=LIKE_EARLY)
-        enough = max(NOISE_RMS_MAX, beside(0.0)[0])
-        ways = (beside, UNEXPLAINED_RMS, np.inf), (alone, NOISE_RMS_MAX, enough)
-        for left, least_held, most in ways[: 1 + (len(given) > 2)]:
-            held, usual = left(0.0)
-            if held <= least_held:
-                continue
-            start = min(np.arange(0.0, EARLIEST, 0.5), key=lambda x: left(x)[0])
-            best = minimize_scalar(
-                lambda periods: left(periods)[0],  # noqa: B023
-                bounds=(max(start - 0.5, 0.0), start + 0.5), method="bounded",
-                options={"xatol": EARLY_TO},
-            )  # fmt: skip
-            least, then = left(best.x)
-            gained = len(self.base()) * (held**2 - least**2) / max(least**2, 1.0)
-            is_sure = gained > BESIDE_NOISE_EVIDENCE * self.correlation**2
-            # Not for a few rows alone, nor for what damping gains that is in its way.
-            is_sure &= share_left(held, least) <= EARLY_LEFT
-            if is_sure and then < usual and least < most and best.x < LAST:
-                return float(best.x) * self.row_sec()
-        return 0.0
+        kind, n, row = self._delay_kind(), self.nuisances(), self.row_sec()
+        if self._found is None:
+            self._found = candidates(self, n, self._settled(self.base()))
+        lacks, train = rich_columns(self, self._of_joints()), self.train()
+
+        def left_by(seconds: float) -> np.ndarray:
+            late = Effect(kind, given, {"delay": -seconds})
+            return self.residual([late])
+
+        early = (self.base() - left_by(row)) / row
+        by_drives, by_bearings = self.late_velocities()
+        rich = np.column_stack([early, by_drives, by_bearings, lacks])
+        left = Screen(self.base(), n.columns, n.prior, train, reach=n.reach).fit(rich)
+        scale = max(left.train, 1.0) * self.correlation
+        # With nuisances' own costs as rows, all is one least-squares problem.
+        free = np.vstack([n.columns[train], np.diag(scale / n.prior)])
+        Q = np.linalg.qr(free)[0]
+
+        def beside(x: np.ndarray) -> np.ndarray:
+            """Of columns (m, k), or one (m,), what no nuisance can be."""
+            x = np.concatenate([x[train], np.zeros((len(n.prior), *x.shape[1:]))])
+            return x - Q @ (Q.T @ x)
+
+        r, others = beside(self.base()), beside(lacks)
+        # The same steps have velocities that drives, and that bearings, act on late, or
+        # early if they are implicit in them.
+        loops = [
+            beside(drives * by_drives + bearings * by_bearings)
+            for drives, bearings in ((0, 0), (1, 1), (1, -1), (-1, -1))
+        ]
+        found = [
+            in_place_of_others(np.column_stack([beside(early) + x, others]), r, scale)
+            for x in loops
+        ]
+        k = max(range(len(loops)), key=lambda k: found[k][1])
+        (first, *c), gained = found[k]
+        if not (gained > SAME_EVIDENCE and 0.0 < first < LAST * row):
+            return 0.0
+        some = others[:, np.array(c) != 0.0]
+
+        def cost(seconds: float) -> float:
+            """Of commands in stairs the column was a chord."""
+            off = beside(left_by(seconds)) - seconds * loops[k]
+            return rms(off - some @ np.linalg.lstsq(some, off)[0])
+
+        around = (0.5 * first, min(1.5 * first, LAST * row))
+        return float(minimize_scalar(cost, bounds=around, method="bounded").x)
+
+    def _of_joints(self) -> list[Candidate]:
+        """Of what is found all that is no matter of channels and commands."""
+        return [c for c in self._found or () if c.kind not in (*SENSED, *PATH)]
+
+    def _delay_kind(self) -> str:
+        return next(k for k, entry in KINDS.items() if entry.path == "delay")
 
     def row_sec(self) -> float:
         """As written: rows may be means."""
         return min(r.period_sec() for r in self.recordings)
 
-    def _left_by_early(
-        self, given: Sequence[str], without: Sequence[str] = ()
-    ) -> Callable[[float], np.ndarray]:
+    def _left_by_early(self, given: Sequence[str]) -> Callable[[float], np.ndarray]:
         """What is left, by rms (with what nuisances take) and robust, if commands of
-        these joints act so many rows early, whatever joints may lack beside it, but for
-        kinds of these units: that hides when they act."""
-        kind = next(k for k, entry in KINDS.items() if entry.path == "delay")
-        n, train, written = self.nuisances(), self.train(), self.row_sec()
-        lacks = [
-            c for c in self._found or () if c.kind not in (*SENSED, *PATH)
-            and not {p.unit for p in KINDS[c.kind].parameters} & {*without}
-        ]  # fmt: skip
-        more = rich_columns(self, lacks)
+        these joints act so many rows early, whatever joints may lack beside it: that
+        hides when they act."""
+        kind, n, train = self._delay_kind(), self.nuisances(), self.train()
+        more = rich_columns(self, self._of_joints())
 
         def left(periods: float) -> np.ndarray:
             """As no sample says when an effort jumps; of each channel, as most joints
             may be at rest."""
-            late = Effect(kind, list(given), {"delay": -periods * written})
+            late = Effect(kind, list(given), {"delay": -periods * self.row_sec()})
             r = self.residual([late]) if periods else self.base()
             fit = Screen(r, n.columns, n.prior, train, reach=n.reach).fit(more)
             off = self.in_noise(r - more @ fit.c - n.columns @ fit.b)
@@ -777,12 +805,14 @@ class MechanismProblem(InverseModel, GapProblem):
             return None
         else:
             model = self
-        moved = moved_links(self, nuisances, end.b)
         size = dict(zip(nuisances.names, end.b, strict=True))
+        timing = self._moved_timing(size)
+        moved = [*moved_links(self, nuisances, end.b), *timing.values()]
         columns, _, names = of_no_scene(model)
         known = np.zeros(len(model.train()))
         for name, column in zip(names, columns, strict=True):
-            known += size.get(name, 0.0) * column
+            if name not in timing:
+                known += size.get(name, 0.0) * column
         slow = self._expected_noise(start, end)
         expects = self._says_expected(slow)
 
@@ -817,6 +847,28 @@ class MechanismProblem(InverseModel, GapProblem):
         rest = unexplained(self, self.in_noise(end.left))
         gap, series, where = measured
         return Outcome(gap, series, rest, expects, where)
+
+    def _moved_timing(self, size: dict[str, float]) -> dict[str, Effect]:
+        """{nuisance: an effect that does the same to windows}, of a simulator's steps:
+        velocities that are late, and rotors where what goes with them is.
+
+        Args: size: {nuisance: as it was found [s]}.
+        """
+        found: dict[str, Effect] = {}
+        if LOOPS not in self.scene.tolerance:
+            return found
+        delay = next(k for k, entry in KINDS.items() if entry.channel == "delay")
+        late = size.get(VELOCITIES_LATE, 0.0)
+        has = zip(self.joints, self.has["velocity"], strict=True)
+        at = [f"{joint}.velocity" for joint, there in has if there]
+        if late > 0.0:
+            found[VELOCITIES_LATE] = Effect(delay, at, {"delay": late})
+        for i, joint in enumerate(self.joints):
+            name = loop_name(joint, "velocity")
+            more = (self._loop(i)[1] + self._damping[i]) * size.get(name, 0.0)
+            if more and more > self.least(ROTOR, [joint]).get("inertia", -np.inf):
+                found[name] = rotor(joint, more)
+        return found
 
     def _model_of(self, recordings: Sequence[Recording]) -> InverseModel:
         """That of other recordings, which is asked for again and again."""

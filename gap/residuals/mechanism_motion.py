@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
+from pydrake.multibody.plant import MultibodyPlant
 
 from makebreak.gap.data.check_drives import untold_joints
 from makebreak.gap.data.recording import Recording
@@ -150,6 +151,7 @@ class MechanismMotion:
             [rotor_before(scene, self.dynamics.plant, joint) for joint in self.joints]
         )
         self._unseen_rotor = self._link_rotor * np.array(self.by_measured)
+        self._damping = bearings_of(self.dynamics.plant)
 
     def _read_tracks(self) -> None:
         self.tracks: list[Track] = []
@@ -247,6 +249,12 @@ class MechanismMotion:
             t = track.middle - path.delay + late
             return np.interp(t, track.time[good], y[good])
         return None
+
+
+def bearings_of(plant: MultibodyPlant) -> np.ndarray:
+    """(n_joints,) what brakes each joint by its own bearing, per speed [N m s/rad]."""
+    joints = sorted(one_dof_joints(plant), key=lambda j: j.velocity_start())
+    return np.array([float(j.default_damping_vector()[0]) for j in joints])
 
 
 def _mean_lagged(step: np.ndarray, u: np.ndarray, lag: float) -> np.ndarray:
