@@ -384,15 +384,15 @@ class InverseModel(WhitenedRows):
             columns.append(self.columns_of(efforts)[:, 0])
             names.append("input_delay of all joints, loop")
         for i in range(len(self.joints)):
-            kp, kd = self._loop(i)
+            stiffness, damping = self._loop(i)
             # A simulator's steps have a joint's own damping as early or late.
-            kd += self._damping[i]
-            for fed_back, gain in (("position", kp), ("velocity", kd)):
-                if gain > 0.0:
-                    columns.append(self._fed_back_late(fed_back, {i: gain}))
+            damping += float(self._damping[i])
+            for fed_back, size in (("position", stiffness), ("velocity", damping)):
+                if size > 0.0:
+                    columns.append(self._fed_back_late(fed_back, {i: size}))
                     names.append(loop_name(self.joints[i], fed_back))
-        late = float(self.scene.tolerance.get(LOOPS, LOOP_SEC))
-        return columns, [late] * len(columns), names
+        known_to = float(self.scene.tolerance.get(LOOPS, LOOP_SEC))
+        return columns, [known_to] * len(columns), names
 
     def _loop(self, i: int) -> tuple[float, float]:
         """Gains of a joint's own loop, of position and velocity."""
