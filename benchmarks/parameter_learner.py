@@ -7,6 +7,7 @@ their 90 % intervals hold the truth. The world is Drake at 1 ms steps.
 
     door    a two-link arm pushes a door on a damped hinge to an angle, and lets it go
     drawer  a finger pushes a drawer whose rail has Coulomb's friction to a place
+    lid     the arm, upright, lifts a lid on a level hinge to an angle, and holds it
     leg     a leg on a vertical rail falls, lands and holds its body at a height
     box     two fingers push a box over a table, in a plane, to a place
 """
@@ -150,6 +151,41 @@ DRAWER = Task(
 )  # fmt: skip
 
 
+def reaching(x: float, z: float) -> list[float]:
+    """Angles of the upright arm with its tip at a place [m], its elbow low."""
+    elbow = float(np.arccos((x**2 + z**2) / (2.0 * 0.35**2) - 1.0))
+    return [0.5 * elbow - float(np.arctan2(z, x)), -elbow]
+
+
+def lid_world(v: dict) -> str:
+    mu, length = v["friction"], "0.35 0 0"
+    tip = p.shape("ball", p.sphere(0.02), length, mu)
+    panel = p.shape("panel", p.box(0.4, 0.1, 0.03 - 2.0 * v["gap"]), "-0.2 0 0", mu)
+    return p.sdf(
+        bar("upper", "world", "0 0 0", 2.0, "0.175 0 0"),
+        turning("upper", "world", "0 1 0", 0.5),
+        bar("fore", "upper", length, 1.6, "0.19 0 0", tip),
+        turning("fore", "upper", "0 1 0", 0.5),
+        bar("lid", "world", "0.75 0 0.3", v["mass"], "-0.2 0 0", panel, 0.12),
+        turning("lid", "world", "0 1 0", v["damping"], driven=False),
+    )
+
+
+LID = Task(
+    "lid", lid_world,
+    lambda v: [p.in_plane("fore", "lid", v["friction"])],
+    {"mass": 2.0, "damping": 0.8, "friction": 0.4, "gap": 0.0},
+    {
+        "mass": Parameter("mass", 0.5, "lid"),
+        "damping": Parameter("damping", 0.5, "lid_joint"),
+        "friction": Parameter("friction", 0.5, pairs=[0]),
+        "gap": Parameter("gap", 0.003, pairs=[0]),
+    },
+    [*reaching(0.42, 0.25), 0.0], [*reaching(0.42, 0.4), 0.4, 0.0, 0.0, 0.0],
+    [0.0, 0.0, 300.0, 5.0, 5.0, 10.0], [0.002] * 2, 2, "mrad", N=20,
+)  # fmt: skip
+
+
 def leg_world(v: dict) -> str:
     mu, foot = v["friction"], "0 0 -0.22"
     ground = p.fixed("ground", p.box(2, 2, 1), f"0 0 {-0.5 - v['gap']}", mu)
@@ -208,7 +244,7 @@ BOX = Task(
     [0.0, 0.0, *[0.0] * 4, 500.0, 500.0, 0.0, 1.0, 1.0, *[0.0] * 3, 5.0, 5.0, 0.0],
     [0.01] * 2, 6, "mm", N=10, careful=[6, 7],
 )  # fmt: skip
-TASKS = {task.name: task for task in (DOOR, DRAWER, LEG, BOX)}
+TASKS = {task.name: task for task in (DOOR, DRAWER, LID, LEG, BOX)}
 
 
 @dataclass(frozen=True, eq=False)
