@@ -44,6 +44,7 @@ MODELS = {
     "push": ("push", ["finger_rail"]),
     "door": ("m", ["upper_joint", "fore_joint"]),
     "drawer": ("m", ["tip_joint"]),
+    "lid": ("m", ["upper_joint", "fore_joint"]),
     "leg": ("m", ["thigh_joint", "shank_joint"]),
 }
 # What gap's kinds are called here; and whether they say what the model has too little.
@@ -143,6 +144,10 @@ SLOW = pytest.mark.slow
         pytest.param(bench.DRAWER, {"damping": 6.0}, marks=SLOW),
         pytest.param(bench.DRAWER, {"coulomb": 1.0}, marks=SLOW),
         pytest.param(bench.DRAWER, {"coulomb": 4.0}, marks=SLOW),
+        # It weighs on the arm all the time.
+        (bench.LID, {"damping": 1.6}),
+        pytest.param(bench.LID, {"mass": 4.0}, marks=SLOW),
+        pytest.param(bench.LID, {"mass": 1.0}, marks=SLOW),
         pytest.param(bench.LEG, {"mass": 2.0}, marks=SLOW),
     ],
     ids=lambda t: getattr(t, "name", str(t)),
@@ -166,7 +171,7 @@ def test_the_learner_and_gap_agree(task, true, tmp_path):
 
 @pytest.mark.parametrize(
     "task",
-    [bench.DOOR, pytest.param(bench.DRAWER, marks=SLOW),
+    [bench.DOOR, pytest.param(bench.DRAWER, marks=SLOW), bench.LID,
      pytest.param(bench.LEG, marks=SLOW)],
     ids=lambda t: t.name,
 )  # fmt: skip

@@ -17,7 +17,6 @@ from makebreak.gap.problem import (
     Nuisances,
 )
 from makebreak.gap.residuals.contact_rows import ContactRows
-from makebreak.gap.simulation.windows import LARGEST
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.ground import PLACE
@@ -107,8 +106,7 @@ class ContactCandidates(ContactRows):
     def _try(self, there: Sequence[Effect], effect: Effect) -> np.ndarray | None:
         """With the weights of what is there: columns are then as linear as can be."""
         try:
-            r = self.left([*there, effect], weighed_as=there)
-            return np.clip(self._flat(r), -LARGEST, LARGEST)
+            return self._left_by([*there, effect], there)
         except (ValueError, RuntimeError):
             return None
 

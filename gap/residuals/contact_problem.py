@@ -252,7 +252,7 @@ class ContactProblem(ContactCandidates, GapProblem):
         """The drives' timing, the robot's links, where a camera is, and its clock."""
         if self._nuisances is not None:
             return self._nuisances
-        base = self._unclipped()
+        base = self.residual()
         columns, prior, names = [], [], []
 
         def add(name: str, moved: np.ndarray, step: float, size: float) -> None:
@@ -266,7 +266,7 @@ class ContactProblem(ContactCandidates, GapProblem):
             step, kept = 1e-4, self._needs
             self._needs = kept - step * self.means.effort_slope
             try:
-                add("timing of the drives", self._unclipped(), step, TIMING)
+                add("timing of the drives", self.residual(), step, TIMING)
             finally:
                 self._needs = kept
         for sensor in self.sensors:
@@ -282,13 +282,13 @@ class ContactProblem(ContactCandidates, GapProblem):
                 self.means.wrench = np.array(kept)
                 self.means.wrench[:, own] += step * more
                 try:
-                    add(name, self._unclipped(), step, size)
+                    add(name, self.residual(), step, size)
                 finally:
                     self.means.wrench = kept
         for name, effect, size in link_changes(self.dynamics, self.scene):
             if set(effect.at) & {*self.bodies, *self.objects}:
                 continue
-            add(name, self._unclipped([effect]), size, size)
+            add(name, self.residual([effect]), size, size)
         for body in self.bodies:
             step = 1e-3
             shifts: list[tuple[str, float, list[Shift]]] = []
@@ -311,11 +311,6 @@ class ContactProblem(ContactCandidates, GapProblem):
             else Nuisances.none(len(base))
         )
         return self._nuisances
-
-    def _unclipped(self, effects: Sequence[Effect] = ()) -> np.ndarray:
-        """residual(), however large: a slope between clipped rows would be too small
-        (a tool's inertia in a jump of acceleration is 150 times a force's noise)."""
-        return self._flat(self.left(effects, weighed_as=self._weights))
 
     def _without_jumps(self, ahead, back, size: float) -> np.ndarray:
         """(m,) a slope, of those one way and the other. Where one of the two shifts

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from makebreak.gap.residuals.felt_walls import FeltWalls
-from makebreak.gap.simulation.windows import LARGEST
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 
@@ -40,14 +39,15 @@ class ContactRows(FeltWalls):
         return self._of_rows(np.arange(len(self.means.time)))
 
     def residual(self, effects: Sequence[Effect] = ()) -> np.ndarray:
-        return self._clipped(effects, self._weights)
+        return self._left_by(effects, self._weights)
 
-    def _clipped(
+    def _left_by(
         self, effects: Sequence[Effect], weights: Sequence[Effect] | None = None
     ) -> np.ndarray:
-        """(m,) residual by the weights of a model; None: by those of its own."""
-        r = self.left(effects, weighed_as=weights)
-        return np.clip(self._flat(r), -LARGEST, LARGEST)
+        """(m,) residual by the weights of a model; None: by those of its own. However
+        large: clipped rows have no slopes, and of what fits alike that which one tries
+        with the larger steps would be the only one to be seen."""
+        return self._flat(self.left(effects, weighed_as=weights))
 
     def _in_table(self, rows: np.ndarray) -> np.ndarray:
         """(K, n) of values of rows (m,), 0 where there is none."""
@@ -63,8 +63,8 @@ class ContactRows(FeltWalls):
         would leave less. Of these each is weighed by its own.
         """
         if _gains(one) != _gains(other):
-            return [(self._clipped(one), self._clipped(other))]
-        return [(self._clipped(one, w), self._clipped(other, w)) for w in (one, other)]
+            return [(self._left_by(one), self._left_by(other))]
+        return [(self._left_by(one, w), self._left_by(other, w)) for w in (one, other)]
 
     def base(self) -> np.ndarray:
         if self._base is None:

@@ -15,7 +15,6 @@ from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Fitted, rms
 from makebreak.gap.residuals.contact_dynamics import SHAPED, ContactDynamics
 from makebreak.gap.simulation.contact_shapes import Slot
-from makebreak.gap.simulation.windows import LARGEST
 from makebreak.models.effects.kind import Effect
 
 TURNED = (2.0, 5.0, 10.0, 20.0)  # [degrees] that a force may turn away,
@@ -110,7 +109,7 @@ def widened_contacts(problem, end: Fitted, most: float) -> tuple[float, list[Wid
         r = np.zeros(problem._shown.shape)
         r[problem._shown] = end.r
         r[:, :n] = left_if_widened(problem, end.effects, pair, size, unit)
-        flat = np.clip(r[problem._shown], -LARGEST, LARGEST)
+        flat = r[problem._shown]
         screen = Screen(flat, nuisances.columns, nuisances.prior, problem.train())
         return rms(screen.fit_nuisances(flat)[1][judged])
 
