@@ -121,6 +121,7 @@ from makebreak.models.effects.kind import (
     sliding_joints,
 )
 from makebreak.models.scene import Scene, read_scene
+from makebreak.models.scene_schema import without_shapes
 
 ProblemOf = Callable[..., tuple[GapProblem, list[Finding]]]
 # Of longer recordings of a mechanism, and of more rows of anything, pieces are used.
@@ -268,6 +269,8 @@ def _compared(
     is_mechanism = _is_mechanism(dynamics, parts.decided)
     decided, reported, done = _conditioned(parts, dynamics, is_mechanism and not meets)
     say("preparing motions and windows")
+    if is_mechanism and not meets:
+        scene = without_shapes(scene)
     problem, found = problem_for(scene, decided, dynamics, jobs, meets)
     as_they_act, told, late = _commands_of(problem)
     if as_they_act is not None:

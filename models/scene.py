@@ -16,6 +16,7 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialVelocity
 from pydrake.multibody.plant import (
     AddMultibodyPlant,
+    ApplyMultibodyPlantConfig,
     MultibodyPlant,
     MultibodyPlantConfig,
 )
@@ -304,16 +305,19 @@ def load_scene(
     check_scene(scene)
     scene = with_actuated_joints(scene)
     section = scene.plant
-    plant, scene_graph = AddMultibodyPlant(
-        MultibodyPlantConfig(
-            time_step=section.time_step,
-            contact_model=section.contact_model,
-            discrete_contact_approximation=section.discrete_contact_approximation,
-            # A controller at 1 kHz must read x[n] at t_n.
-            use_sampled_output_ports=False,
-        ),
-        builder,
+    config = MultibodyPlantConfig(
+        time_step=section.time_step,
+        contact_model=section.contact_model,
+        discrete_contact_approximation=section.discrete_contact_approximation,
+        # A controller at 1 kHz must read x[n] at t_n.
+        use_sampled_output_ports=False,
     )
+    if section.shapes:
+        plant, scene_graph = AddMultibodyPlant(config, builder)
+    else:
+        plant = builder.AddNamedSystem("plant", MultibodyPlant(section.time_step))
+        ApplyMultibodyPlantConfig(config, plant)
+        scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
     plant.mutable_gravity_field().set_gravity_vector(section.gravity)
     effects = sorted(
         (as_kind(effect) for effect in scene.effects),

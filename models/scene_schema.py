@@ -1,7 +1,7 @@
 """The sections of a scene file as dataclasses, and checks of their values."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
 from pydrake.multibody.parsing import ModelDirective
@@ -57,6 +57,7 @@ class PlantSection:
     gravity: list[Annotated[float, Between(-1e3, 1e3, "m/s2")]] = field(
         default_factory=lambda: [0.0, 0.0, -9.81]
     )
+    shapes: bool = True  # False: nothing touches, and no mesh is read.
 
 
 @dataclass
@@ -217,3 +218,12 @@ def as_kind(effect: Effect) -> Effect:
         raise ValueError(f"effect {effect.kind} needs `at`: where it acts")
     check_parameters(effect, KINDS[effect.kind])
     return effect
+
+
+def without_shapes(scene: Scene) -> Scene:
+    """The scene for use where nothing touches, which is loaded in no time if its models
+    have large meshes. As it is where its effects are of shapes."""
+    kinds = {KINDS[effect.kind].at for effect in scene.effects}
+    if scene.friction_zones or kinds & {"pair", "ground", "free body"}:
+        return scene
+    return replace(scene, plant=replace(scene.plant, shapes=False))

@@ -2,6 +2,7 @@
 
 import os
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +11,13 @@ import trimesh
 from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.gap.data.robot import propose_scene, read_log, read_robot
+from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.effects.kind import Effect
 from makebreak.models.effects.model_text import Inertial
 from makebreak.models.model_export import to_mjcf, to_urdf
 from makebreak.models.model_inertias import fault_of, faults_of, repaired
 from makebreak.models.scene import load_scene, read_scene
+from makebreak.models.scene_schema import without_shapes
 from makebreak.scripts.cli import main
 
 LINK = """<link name="{name}"><inertial><origin xyz="0 0 -0.2"/><mass value="{m}"/>
@@ -128,6 +132,28 @@ def test_the_hull_of_a_mesh_of_any_format_is_that_of_its_corners(name, tmp_path)
     corners = np.array([hull.vertex(i) for i in range(hull.num_vertices())])
     # STL and DAE keep single precision.
     np.testing.assert_allclose(np.ptp(corners, axis=0), [0.2, 0.4, 0.6], atol=1e-6)
+
+
+def test_a_scene_without_shapes_has_the_same_dynamics_and_reads_no_mesh(tmp_path):
+    trimesh.creation.icosphere(5, 0.2).export(tmp_path / "ball.obj")
+    scene = scene_of(tmp_path, arm(tmp_path, more=mesh("ball.obj")))
+    bare = without_shapes(scene)
+    with_mesh = SceneDynamics(scene)
+    assert with_mesh.plant.num_collision_geometries() == 1
+    (tmp_path / "ball.obj").write_text("no mesh any more")
+    other = SceneDynamics(bare)
+    assert other.plant.num_collision_geometries() == 0
+    rng = np.random.default_rng(1)
+    n = other.plant.num_velocities()
+    motion = rng.normal(size=(3, 20, n))
+    np.testing.assert_array_equal(
+        other.inverse_dynamics(*motion), with_mesh.inverse_dynamics(*motion)
+    )
+    friction = Effect(
+        "contact_friction", ["arm.tip", "world.ground"], {"friction": 1.0}
+    )
+    touching = replace(scene, effects=[friction])
+    assert without_shapes(touching) is touching
 
 
 def test_a_mesh_in_a_comment_and_one_for_display_stop_nothing(tmp_path):
