@@ -53,15 +53,8 @@ def as_obj(path: Path) -> Path:
     return _converted(path, path.stat().st_mtime_ns)
 
 
-@lru_cache(maxsize=4096)
-def _converted(path: Path, changed: int) -> Path:
-    content = path.read_bytes()
-    name = hashlib.sha256(path.suffix.lower().encode() + content).hexdigest()[:24]
-    known = cache_folder() / f"{name}.is"
-    if known.is_file():
-        obj = cache_folder() / known.read_text()
-        if obj.is_file():
-            return obj
+def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (n, 3) [m] and triangles (m, 3)."""
     import trimesh  # Here, as it takes long to import.
 
     try:
@@ -78,8 +71,39 @@ def _converted(path: Path, changed: int) -> Path:
         raise ValueError(f"{path} cannot be read as a mesh: {error}") from None
     if not len(faces) or not np.isfinite(vertices).all():
         raise ValueError(f"{path} holds no mesh of triangles")
+    return vertices, faces
+
+
+@lru_cache(maxsize=4096)
+def _converted(path: Path, changed: int) -> Path:
+    content = path.read_bytes()
+    name = hashlib.sha256(path.suffix.lower().encode() + content).hexdigest()[:24]
+    known = cache_folder() / f"{name}.is"
+    if known.is_file():
+        obj = cache_folder() / known.read_text()
+        if obj.is_file():
+            return obj
+    vertices, faces = _read(path)
     obj = write_obj(vertices, faces)
     aside = known.with_suffix(f".{os.getpid()}")
     aside.write_text(obj.name)
     aside.replace(known)
     return obj
+
+
+def coarse(path: Path, cells: int = 48) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (n, 3) and triangles (m, 3) of a mesh for pictures: those in one cell of
+    a grid, `cells` along the longest side, are one.
+
+    Raises: ValueError for a file that holds no triangles that can be read.
+    """
+    vertices, faces = _read(path)
+    size = max(float(np.ptp(vertices, axis=0).max()), 1e-300) / cells
+    cell = np.round((vertices - vertices.min(axis=0)) / size).astype(int)
+    _, of, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
+    middle = np.zeros((len(count), 3))
+    np.add.at(middle, of.ravel(), vertices)
+    faces = of.ravel()[faces]
+    a, b, c = faces.T
+    faces = faces[(a != b) & (b != c) & (c != a)]
+    return middle / count[:, None], np.unique(faces, axis=0)

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from effect_scenes import double, on_ground, pendulum
 from pydrake.systems.framework import DiagramBuilder
 
@@ -27,6 +28,7 @@ from makebreak.gap.simulation.scene_simulation import SceneSimulation
 from makebreak.gap.simulation.windows import WindowModel
 from makebreak.gap.verdict import says
 from makebreak.models.effects.kind import Effect
+from makebreak.models.meshes import coarse
 from makebreak.models.scene import InitialSection, load_scene
 from makebreak.models.scene_schema import ActuationSection
 from makebreak.scripts.cli.gap_command import effects_table, write_comparison
@@ -322,3 +324,24 @@ def test_what_the_page_shows_is_written_as_mcap_too(tmp_path):
     still = replace(result, series=[])
     (note,) = write_comparison(still, scene, recordings, tmp_path / "no.mcap")
     assert "no motion was simulated" in note
+
+
+def test_a_large_mesh_is_shown_by_a_coarse_one(tmp_path):
+    ball = trimesh.creation.icosphere(6, 0.1)
+    ball.apply_translation([0.0, 0.0, -0.3])
+    ball.export(tmp_path / "ball.obj")
+    vertices, faces = coarse(tmp_path / "ball.obj")
+    assert len(faces) < 0.25 * len(ball.faces)
+    far = np.linalg.norm(vertices - [0.0, 0.0, -0.3], axis=1)
+    assert (np.abs(far - 0.1) < 0.2 / 48).all()
+    left = trimesh.Trimesh(vertices, faces)
+    assert left.is_watertight and abs(left.volume / ball.volume - 1.0) < 0.02
+    scene, recordings = swung(tmp_path, "effort command")
+    model = WindowModel(scene, recordings, 0.3)
+    plain_page = comparison_html(result_of(model, [], scene), scene, recordings)
+    file = next(tmp_path.glob("*.urdf"))
+    shape = '<visual><geometry><mesh filename="ball.obj"/></geometry></visual></link>'
+    file.write_text(file.read_text().replace("</link>", shape))
+    page = comparison_html(result_of(model, [], scene), scene, recordings)
+    more = len(page) - len(plain_page)
+    assert 0 < more < (tmp_path / "ball.obj").stat().st_size

@@ -14,6 +14,7 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.geometry import (
     Cylinder,
     HalfSpace,
+    Mesh,
     Meshcat,
     MeshcatAnimation,
     Rgba,
@@ -29,6 +30,7 @@ from makebreak.gap.data.recording import Recording
 from makebreak.gap.report.clock import zero_of
 from makebreak.gap.result import GapResult, Series, plain
 from makebreak.models.effects.kind import full_name, one_dof_joints, sliding_joints
+from makebreak.models.meshes import coarse
 from makebreak.models.scene import LoadedScene, Scene, initial_for, load_scene
 
 _WINDOW_SEC = 1.0  # What is shorter is slowed down to last so long, on average.
@@ -325,8 +327,16 @@ def _side(target: np.ndarray, behind: list[np.ndarray]) -> np.ndarray:
 
 def _put(meshcat: Meshcat, path: str, shape, colour: Rgba, pose: RigidTransform):
     try:
-        meshcat.SetObject(path, shape, colour)
-    except RuntimeError:  # A mesh that cannot be read: the rest is still worth it.
+        if isinstance(shape, Mesh) and shape.source().is_path():
+            # As it is, it would be in the page several times, with all its texts.
+            vertices, faces = coarse(shape.source().path())
+            meshcat.SetTriangleMesh(
+                path, np.asfortranarray((vertices * shape.scale3()).T),
+                np.asfortranarray(faces.T.astype(np.int32)), colour,
+            )  # fmt: skip
+        else:
+            meshcat.SetObject(path, shape, colour)
+    except (RuntimeError, ValueError):  # A mesh that cannot be read: not the page.
         return
     meshcat.SetTransform(path, pose)
 
