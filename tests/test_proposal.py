@@ -9,6 +9,7 @@ from gap_benchmark.cases import cases, make
 from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.gap.data.findings import NO_COLUMN
+from makebreak.gap.data.joined import read_joined
 from makebreak.gap.data.match import JointName
 from makebreak.gap.data.proposal import of_one_drive, propose
 from makebreak.gap.data.reading import read_recording
@@ -109,6 +110,25 @@ def test_a_force_is_the_effort_of_a_joint_that_slides_and_has_its_name():
     assert found["lift_joint.actual_force"] == "g.lift_joint.effort_measured"
     assert found["lift_joint.force_cmd"] == "g.lift_joint.effort_command"
     assert [found[n] for n in names[2:]] == [None] * 3
+
+
+def test_german_degrees_and_a_stamp_called_stamp_are_read(tmp_path):
+    ends = ("ist_grad", "soll_grad", "moment_promille")
+    names = [f"elbow_flex_{end}" for end in ends]
+    columns = {"t": T} | sines(names, 40.0)
+    found = {m.column: m for m in propose(columns, NAMED)}
+    for name, what in zip(names, ("position", "position_command"), strict=False):
+        assert found[name].channel == f"so.elbow_flex.{what}"
+        assert found[name].scale == pytest.approx(np.pi / 180.0)
+    assert found[names[2]].channel is None  # Per mille of what?
+    # A proposal that names stamp, of stamp/sec and stamp/nanosec, fits its log.
+    rows = [{"stamp": {"sec": int(t), "nanosec": int(round(1e9 * (t % 1.0)))}, "q": t}
+            for t in T]  # fmt: skip
+    file = tmp_path / "log.jsonl"
+    file.write_text("\n".join(map(json.dumps, rows)))
+    said = {"stamp": "time", "stamp/sec": None, "stamp/nanosec": None}
+    table, _ = read_joined(file, {"columns": said})
+    np.testing.assert_allclose(table.columns["stamp"], T, atol=1e-8)
 
 
 def test_numbers_count_from_zero_where_any_group_does():

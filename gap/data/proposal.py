@@ -16,7 +16,7 @@ from makebreak.gap.data.csv_table import is_nameless
 from makebreak.gap.data.match import AS_SAID, JointName, Match, plain_name
 from makebreak.gap.data.stamps import is_backward
 from makebreak.gap.data.table import COMMANDS, is_channel
-from makebreak.gap.data.units import in_units, quantity_of_unit, unit_in_name
+from makebreak.gap.data.units import DEGREES, in_units, quantity_of_unit, unit_in_name
 
 UNKNOWN_JOINT = "of an unknown joint"  # Why such a column is left out.
 _COMMAND = set(
@@ -35,9 +35,10 @@ _WORDS = {
         "thetadot v".split()
     ),
     "position": set(
-        "position positions pos q qpos angle angles theta phi deg rad state states "
+        "position positions pos q qpos angle angles theta phi rad state states "
         "joint joints axis axes encoder action".split()
-    ),
+    )
+    | {*DEGREES},
 }
 CURRENT = "a current"  # Why such a column is left out begins so.
 # Of a joint that slides a force is its effort; else it is a wrench's, or nobody's.

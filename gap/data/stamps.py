@@ -102,7 +102,8 @@ def whole_stamp(columns: Mapping[str, np.ndarray]) -> tuple[str, np.ndarray] | N
 
 def is_part_of(stamp: str, name: str) -> bool:
     """Whether a column has the seconds or nanoseconds of a stamp."""
-    return _part_of(name, "(n(ano)?)?secs?") == ("" if stamp == "stamp" else stamp)
+    part = _part_of(name, "(n(ano)?)?secs?")
+    return part is not None and (part or "stamp") == stamp
 
 
 def _part_of(name: str, unit: str) -> str | None:

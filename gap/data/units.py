@@ -69,15 +69,16 @@ _TIMES = (*(10.0**k for k in range(-6, 7)), 60.0, 3600.0, 86400.0)
 # A factor to SI of what stands at a name's end.
 _LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6,
             "\u00b5m": 1e-6, "\u03bcm": 1e-6}  # fmt: skip
-_ANGLES = {"rad": 1.0, "mrad": 1e-3, "deg": DEG, "degree": DEG, "degrees": DEG,
-           "°": DEG, "mdeg": 1e-3 * DEG, "rev": TURN}  # fmt: skip
+DEGREES = ("deg", "degree", "degrees", "grad")  # The last one is German.
+_ANGLES = {"rad": 1.0, "mrad": 1e-3, "°": DEG, "mdeg": 1e-3 * DEG, "rev": TURN,
+           **dict.fromkeys(DEGREES, DEG)}  # fmt: skip
 _SPIN = {"rpm": TURN / 60.0, "degps": DEG, "dps": DEG, "radps": 1.0,
          "1/min": TURN / 60.0, "rev/min": TURN / 60.0}  # fmt: skip
 _FORCES = {"n": 1.0, "kn": 1e3, "mn": 1e-3, "megan": 1e6}
 _TORQUES = {"nm": 1.0, "n.m": 1.0, "ncm": 1e-2, "nmm": 1e-3, "mnm": 1e-3, "knm": 1e3,
             "meganm": 1e6}  # fmt: skip
 # Of an effort these need a number that the log does not have.
-_NO_EFFORT = ("%", "a", "ma", "percent", "permille", "‰")
+_NO_EFFORT = ("%", "a", "ma", "percent", "permille", "promille", "‰")
 # These may be anything, such as a part of a joint's name, if not in brackets.
 _IN_BRACKETS = ("rev", "ma")
 
@@ -126,7 +127,7 @@ def unit_in_name(match: Match, joint: JointName) -> tuple[str, float | None]:
     if unit in known:
         return unit, known[unit]
     words = [] if joint.prismatic else words_of(match.column)
-    inside = {"deg": DEG, "degree": DEG, "degrees": DEG, "rad": 1.0}
+    inside = {"rad": 1.0, **dict.fromkeys(DEGREES, DEG)}
     inside |= _SPIN if what == "velocity" else {}
     own = words_of(joint.name.rsplit(".", 1)[-1])
     word = next((w for w in words if w in inside and w not in own), "")
