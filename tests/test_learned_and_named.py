@@ -1,6 +1,7 @@
 """What ParameterLearner learns while it works, and what `makebreak gap` names on the
 recording of the same run, are the same within both deviations."""
 
+import json
 import re
 from dataclasses import replace
 
@@ -16,6 +17,7 @@ import makebreak as mb
 from makebreak.benchmarks import parameter_learner as bench
 from makebreak.benchmarks.plants import diagram_of
 from makebreak.gap import run_gap
+from makebreak.scripts.cli import main
 
 NINETY = bench.NINETY
 ROW = 0.002  # Time between rows [s].
@@ -179,3 +181,47 @@ def test_the_right_model_is_no_gap(task, tmp_path):
     learned_and_recorded(task, task.values, tmp_path)
     result = run_gap(tmp_path / "scene.yaml", [tmp_path / "log.csv"])
     assert result.verdict == "no_gap", result.says
+
+
+def of_experiment(name, seed, settings, out):
+    """The results of a run with learner=parameters, and what gap makes of it."""
+    asked = ["run", name, "--no-meshcat", "--quiet", "--seed", str(seed)]
+    asked += ["--duration", "40"] if name == "ball_rolling" else []
+    settings = ["learner=parameters", *settings]
+    assert main([*asked, "--out", str(out), "--set", *settings]) in (0, 1)
+    learned = json.loads((out / "result.json").read_text())
+    return learned, run_gap(out / "model.yaml", [out / "recording.csv"])
+
+
+@pytest.mark.slow
+def test_a_pushed_object_s_frictions_agree(tmp_path):
+    """Three goals, with half the friction in the model."""
+    wrong = ["n_goals=3", "model.friction=0.25"]
+    learned, result = of_experiment("push_object", 26200, wrong, tmp_path / "run")
+    found = {
+        e.at[0].rpartition(".")[2]: e.parameters["friction"]
+        for e in result.effects if e.kind == "contact_friction"
+    }  # fmt: skip
+    assert len(result.effects) == 2, result.says
+    for of, pairs in (("finger", "0"), ("table", "1_2_3")):
+        low, high = (learned[f"learned_friction_of_pairs_{pairs}_{end}"]
+                     for end in ("low", "high"))  # fmt: skip
+        its = found[of]
+        assert low - NINETY * its.std <= its.value <= high + NINETY * its.std
+        assert low <= 0.5 <= high
+        assert its.value == pytest.approx(0.5, rel=0.1)
+
+
+@pytest.mark.slow
+def test_a_rolled_ball_s_size_agrees(tmp_path):
+    """The learner's gap is that of the ball's top, where it is pushed: twice what the
+    radius is off."""
+    learned, result = of_experiment("ball_rolling", 8430, [], tmp_path / "run")
+    (size,) = result.effects
+    assert size.kind == "object_size", result.says
+    radius = size.parameters["radius"]
+    low, high = (learned[f"learned_gap_of_pairs_0_{end}"] for end in ("low", "high"))
+    gap, std = 2.0 * (0.0365 - radius.value), 2.0 * radius.std
+    assert low - NINETY * std <= gap <= high + NINETY * std
+    assert low <= 0.010 <= high
+    assert radius.value == pytest.approx(0.0315, rel=0.01)
