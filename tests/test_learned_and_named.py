@@ -183,6 +183,17 @@ def test_the_right_model_is_no_gap(task, tmp_path):
     assert result.verdict == "no_gap", result.says
 
 
+def test_half_the_damping_of_a_lid_that_swings_is_not_twice_its_mass(tmp_path):
+    """The same motion, but for the push; hundreds of times the noise off without it."""
+    x_desired = [*bench.reaching(0.5, 0.3), 1.4, 0.0, 0.0, 0.0]
+    thrown = replace(bench.LID, x_desired=x_desired)
+    learned_and_recorded(thrown, thrown.values | {"damping": 0.4}, tmp_path)
+    result = run_gap(tmp_path / "scene.yaml", [tmp_path / "log.csv"])
+    found = named(result.effects, thrown.values)
+    assert found.keys() == {"damping"}, result.says
+    assert found["damping"][0] == pytest.approx(0.4, rel=0.01)
+
+
 def of_experiment(name, seed, settings, out):
     """The results of a run with learner=parameters, and what gap makes of it."""
     asked = ["run", name, "--no-meshcat", "--quiet", "--seed", str(seed)]
