@@ -17,7 +17,7 @@ from makebreak.gap.data.proposal import UNKNOWN_JOINT
 
 ALIKE = 0.97  # Squared correlation of a position with its velocity's integral.
 FOLLOWS = 0.05  # Of a joint's range, how far it stays behind its command.
-WHY = "the file has no names; by what is in it"
+BY_CONTENT = "the file has no names; by what is in it"
 
 Layout = dict[str, tuple[int, int]]  # {quantity: its first column, from joint to joint}
 
@@ -54,7 +54,9 @@ def layouts(
             for k, joint in enumerate(joints)
         }
         own = [
-            Match(m.column, channel[m.column], why=WHY) if m.column in channel else m
+            Match(m.column, channel[m.column], why=BY_CONTENT)
+            if m.column in channel
+            else m
             for m in matches
         ]
         found.append(({what: names[at] for what, (at, _) in layout.items()}, own))

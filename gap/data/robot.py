@@ -38,7 +38,7 @@ from makebreak.gap.data.findings import (
 )
 from makebreak.gap.data.joined import read_joined
 from makebreak.gap.data.match import AS_SAID, JointName, Match
-from makebreak.gap.data.nameless import layouts
+from makebreak.gap.data.nameless import BY_CONTENT, layouts
 from makebreak.gap.data.own_contacts import overlapping
 from makebreak.gap.data.proposal import (
     CURRENT,
@@ -506,8 +506,14 @@ def _named(log: Log, robot: Robot, said: list[Said]) -> list[Match]:
         return matches
     shown = ", ".join(f"{what} ({column} and on)" for what, column in first.items())
     says = f"{log.path.name} names no columns. By what is in them they are {shown}."
-    if also := [other["effort_measured"] for share, other, own in tried
-                if share < 0.0 and own is not best]:  # fmt: skip
+    used = {m.column for m in best if m.channel}
+    also = [
+        other["effort_measured"] for share, other, own in tried
+        if share < 0.0 and "effort_measured" in other
+        and used.isdisjoint(m.column for m in own if m.why == BY_CONTENT
+                            and str(m.channel).endswith("effort_measured"))
+    ]  # fmt: skip
+    if also:
         says += f" What begins with {', '.join(also)} could be the efforts as well."
     said.append(Said(UNNAMED, robot.joints[0].name, float(len(first)), says))
     return best
