@@ -130,6 +130,25 @@ def test_a_tree_of_joints_moves_as_in_drake(tmp_path, lacks, monkeypatch):
     assert np.abs(want[:, :4] - want[0, :4]).max(axis=0).min() > 0.02  # It does move.
 
 
+def test_a_joint_that_nothing_drives_may_have_a_rotor(tmp_path):
+    scene, joints = tree(tmp_path)
+    driven = replace(
+        scene.actuation, joints=joints[:3], kp=[300.0, 40.0, 15.0], kd=[20, 2, 0.5],
+        limit=[50.0, 8.0, 3.0],
+    )  # fmt: skip
+    scene = with_effects(
+        replace(scene, actuation=driven), ("rotor_inertia", "p.wave", dict(inertia=0.1))
+    )
+    time, told = commands(joints[:3])
+    channels = [f"{joint}.position" for joint in joints]
+    start = at_rest_but({"p.wave": 0.5})
+    want = SceneSimulation(scene).run(start, time, channels, told)
+    fast = DrivenArmSimulation(scene)
+    fast.tol = 1e-4
+    have = fast.run(start, time, channels, told)
+    np.testing.assert_allclose(have, want, atol=3e-4)
+
+
 @pytest.mark.parametrize("effort", [True, False])
 def test_efforts_and_velocities_may_be_commanded(tmp_path, effort):
     scene = double(tmp_path)

@@ -34,10 +34,13 @@ from makebreak.models.effects.actuation_path import (
     TIME_CONSTANT,
     DriveLaw,
 )
+from makebreak.models.effects.joints import rotor
 from makebreak.models.effects.kind import (
     Effect,
+    actuator_of,
     full_name,
     model_names,
+    one_dof_joints,
     velocity_unit,
 )
 from makebreak.models.effects.measured_channels import ChannelMap, channel_maps
@@ -76,7 +79,15 @@ class DrivenArmScene:
     def __init__(self, scene: Scene):
         self.scene = scene = replace(scene, plant=replace(scene.plant, time_step=0.0))
         self._plants: dict[tuple, tuple[MultibodyPlant, JointTree]] = {}
-        self._plant(scene.effects)
+        # Joints that nothing drives: a rotor needs an actuator there, too.
+        self._passive: tuple[str, ...] = ()
+        plant, _ = self._plant([e for e in scene.effects if not _of_joint(e.kind)])
+        self._passive = tuple(
+            full_name(plant, joint)
+            for joint in one_dof_joints(plant) if actuator_of(plant, joint) is None
+        )  # fmt: skip
+        if self._passive:
+            self._plants.clear()
         self.arm(())
 
     def arm(self, effects: Sequence[Effect]) -> DrivenArm:
@@ -146,7 +157,8 @@ class DrivenArmScene:
             undriven = self.scene.actuation
             if COMMANDS_OF[undriven.type]:
                 undriven = replace(undriven, type="effort")
-            scene = replace(self.scene, actuation=undriven, effects=list(effects))
+            none = [rotor(joint, 0.0) for joint in self._passive]
+            scene = replace(self.scene, actuation=undriven, effects=[*effects, *none])
             loaded = load_scene(scene, DiagramBuilder())
             try:
                 self._plants[key] = loaded.plant, joint_tree(loaded.plant)
@@ -179,6 +191,8 @@ class DrivenArmScene:
                 name, i = full_name(plant, joint), joint.velocity_start()
                 path[i] = numbers[[GAIN, BIAS, LIMIT, TIME_CONSTANT, SHARE], k]
                 slow[i], most[i] = velocity_unit(joint), actuator.effort_limit()
+                if name in self._passive:
+                    continue
                 if not looped:
                     driven[i] = EFFORT
                 elif whole is not None and name in of:
