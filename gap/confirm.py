@@ -113,12 +113,12 @@ def _vetoes(
         if acting:
             found.setdefault(acting[-1], why)
     if not found and _is_worse_whole(gap):
-        found[len(choices) - 1] = not_confirmed(gap)
+        found[len(choices) - 1] = _goes("simulated error", gap.before, gap.after)
     if not found and selection.end.b.any():
         written = judge(_as_written(selection))
         if written is not None and _is_worse_whole(written.gap):
-            found[len(choices) - 1] = (
-                f"Without the nuisance parameters: {not_confirmed(written.gap)}"
+            found[len(choices) - 1] = "Without the nuisance parameters: " + _goes(
+                "simulated error", written.gap.before, written.gap.after
             )
     if found:
         return [(choices[k], why) for k, why in found.items()]
@@ -327,11 +327,14 @@ def _equations_confirm(gap: GapMeasure) -> bool:
 
 def not_confirmed(gap: GapMeasure) -> str:
     """In words, that data held out for the report do not bear out what is named."""
-    by, (before, after) = "simulated error", (gap.before, gap.after)
-    if max(before, after) <= AGREEMENT_RMS_MAX and gap.in_equations is not None:
-        by, (before, after) = "error in the equations of motion", gap.in_equations
+    if max(gap.before, gap.after) <= AGREEMENT_RMS_MAX and gap.in_equations is not None:
+        return _goes("error in the equations of motion", *gap.in_equations)
+    return _goes("simulated error", gap.before, gap.after)
+
+
+def _goes(what: str, before: float, after: float) -> str:
     return (
-        f"On the data held out for the report the effects take the {by} from "
+        f"On the data held out for the report the effects take the {what} from "
         f"{figure(before)} to {figure(after)} times the expected error."
     )
 

@@ -283,3 +283,20 @@ def test_what_the_scenes_step_errs_by_is_no_gap():
     assert decide(replace(facts, below=1.2))[0] == "no_gap"
     assert decide(replace(facts, below=2.2))[0] == "gap_unnamed"
     assert decide(replace(facts, below=1.2, far=True))[0] == "gap_unnamed"
+
+
+def test_why_an_effect_goes_is_said_by_what_it_makes_worse():
+    """Windows get worse at a joint that nothing acts at; equations say the reverse."""
+
+    class Elsewhere(Held):
+        def outcome(self, effects, *of, **more):
+            after = 1.4 if effects else 1.05
+            per = {"arm.j9.position": {"before": 1.05, "after": after}}
+            both = (5.9, 0.7 if effects else 5.9)
+            gap = GapMeasure(1.05, after, 1.0, 0.3, per, n_windows=9, in_equations=both)
+            return Outcome(gap)
+
+    problem = Elsewhere({})
+    found = confirm(problem, selection_of(problem))
+    assert found.vetoed and not found.selection.choices
+    assert all("simulated error from 1.05 to 1.4" in why for _, why in found.vetoed)
