@@ -92,7 +92,7 @@ from makebreak.gap.search.chosen_by_simulation import (
     kept_by_simulation,
     preferred_by_simulation,
 )
-from makebreak.gap.search.select import select, without
+from makebreak.gap.search.select import select, with_errors_of, without
 from makebreak.gap.search.softer_by_simulation import softer_by_simulation
 from makebreak.gap.search.trust import drift_sentences, scatter, trust_in
 from makebreak.gap.simulation.measure import WINDOW_SEC
@@ -595,11 +595,18 @@ def conclude(
             if outcome is None and found.selection.choices:
                 vetoed += [(c, _TOO_SHORT_TO_REPORT) for c in selection.choices]
                 selection = without(problem, selection, *selection.effects())
-            elif not found.vetoed:
-                selection = found.selection
-                break
             else:
-                selection = found.selection
+                stays = found.selection
+                selection = present().if_time(
+                    "what each effect explains",
+                    partial(with_errors_of, problem, stays), stays,
+                )  # fmt: skip
+                idle = [c for c in selection.choices if c.before <= c.after]
+                if not found.vetoed and not idle:
+                    break
+                vetoed += [(c, _IDLE) for c in idle]
+                gone = [choice.effect for choice in idle]
+                selection = without(problem, selection, *gone) if gone else selection
         if chosen_on is not None:
             chosen_on = problem.outcome(
                 selection.effects(), selection.start, selection.end,
@@ -664,6 +671,10 @@ def conclude(
     )  # fmt: skip
 
 
+_IDLE = (
+    "Beside the other effects it takes nothing off the error of the data by which "
+    "effects were chosen."
+)
 _TOO_SHORT_TO_REPORT = (
     "The recordings are too short to hold out a part for the report; without it "
     "nothing is named."

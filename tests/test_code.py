@@ -419,3 +419,8 @@ def test_each_change_is_in_a_group_of_the_changelog():
     for version in text.split("\n## ")[1:]:
         before_groups = version.split("\n### ")[0]
         assert "\n- " not in before_groups, version.splitlines()[0]
+
+
+def test_one_person_can_hold_the_gap_method_in_the_head():
+    words = (ROOT / "docs" / "gap_method.md").read_text().split()
+    assert len(words) <= 3000

@@ -14,6 +14,7 @@ from makebreak.gap.problem import Outcome
 from makebreak.gap.result import GapMeasure, InUnits
 from makebreak.gap.search.choice import Choice, Selection
 from makebreak.gap.search.chosen_by_simulation import above_step
+from makebreak.gap.search.select import with_errors_of
 from makebreak.gap.verdict import Facts, decide, too_weak
 from makebreak.models.effects.kind import Effect
 
@@ -300,3 +301,16 @@ def test_why_an_effect_goes_is_said_by_what_it_makes_worse():
     found = confirm(problem, selection_of(problem))
     assert found.vetoed and not found.selection.choices
     assert all("simulated error from 1.05 to 1.4" in why for _, why in found.vetoed)
+
+
+def test_what_an_effect_explains_is_asked_beside_all_that_stays():
+    """The figures of the report: errors with all effects, and without each."""
+    problem = Held({j: (9.0, 1.0) for j in JOINTS})
+    stale = selection_of(problem)
+    selection = with_errors_of(problem, stale)
+    screen = selection.screen(problem)
+    assert {c.after for c in selection.choices} == {stale.end.score}
+    for k, choice in enumerate(selection.choices):
+        rest = [e for i, e in enumerate(selection.effects()) if i != k]
+        exact = fit_effects(problem, screen, rest).score
+        assert choice.before == pytest.approx(exact, rel=1e-6) and exact > choice.after

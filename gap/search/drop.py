@@ -89,6 +89,23 @@ def drop_needless(
     return chosen, current
 
 
+def with_errors(
+    search: Comparison, chosen: list[Choice], current: Fitted
+) -> list[Choice]:
+    """The choices with the held-out error of all of them, and of all but each, the
+    others free to first order."""
+    slopes = search.slopes(chosen, current)
+    after = search.screen(current.r, current.fit.train).evaluate(current.r).score
+    out = []
+    for k, choice in enumerate(chosen):
+        try:
+            before, _ = _by_columns(search, search.problem, current, slopes, [k])
+        except ValueError:  # What is left would be no scene.
+            before = float("inf")
+        out.append(replace(choice, before=before, after=after))
+    return out
+
+
 def _by_columns(
     search: Comparison, problem: GapProblem, current: Fitted,
     slopes: tuple[np.ndarray, np.ndarray], gone: Sequence[int],
