@@ -821,8 +821,8 @@ def test_a_tool_that_is_heavier_is_no_gain(tmp_path):
 
 
 def test_the_inertia_that_a_sensor_feels_is_a_slope_however_large_rows_are(tmp_path):
-    """Rows are clipped at 200 times the noise; the slope of what a sensor reads of its
-    tool's own motion, in a jump of acceleration, was a third of what it is."""
+    """Of clipped rows the slope of what a sensor reads of its tool's own motion, in a
+    jump of acceleration, was a third of what it is."""
     problem = PressingProblem(write_scene(tmp_path), record(tmp_path, high=0.1)[:1])
     which = problem.nuisances().names.index("inertia felt by gantry.tip")
     before = problem.nuisances().columns[:, which]
@@ -831,7 +831,7 @@ def test_the_inertia_that_a_sensor_feels_is_a_slope_however_large_rows_are(tmp_p
     assert np.abs(before[on]).max() > 10.0
     problem._base = problem._nuisances = None
     problem.means.wrench[:, 2] += 20.0  # [N]
-    assert np.abs(problem.base()[on]).max() == 200.0
+    assert np.abs(problem.base()[on]).max() > 200.0
     after = problem.nuisances().columns[:, which]
     np.testing.assert_allclose(after[on], before[on], atol=1e-6 * np.abs(before).max())
 
