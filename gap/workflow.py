@@ -92,7 +92,8 @@ from makebreak.gap.search.chosen_by_simulation import (
     kept_by_simulation,
     preferred_by_simulation,
 )
-from makebreak.gap.search.select import select, with_errors_of, without
+from makebreak.gap.search.drop import with_errors
+from makebreak.gap.search.select import select, without
 from makebreak.gap.search.softer_by_simulation import softer_by_simulation
 from makebreak.gap.search.trust import drift_sentences, scatter, trust_in
 from makebreak.gap.simulation.measure import WINDOW_SEC
@@ -595,18 +596,21 @@ def conclude(
             if outcome is None and found.selection.choices:
                 vetoed += [(c, _TOO_SHORT_TO_REPORT) for c in selection.choices]
                 selection = without(problem, selection, *selection.effects())
+            elif found.vetoed:
+                selection = found.selection
             else:
-                stays = found.selection
-                selection = present().if_time(
+                asked = present().if_time(
                     "what each effect explains",
-                    partial(with_errors_of, problem, stays), stays,
+                    lambda: with_errors(problem, found.selection), None,  # noqa: B023
                 )  # fmt: skip
-                idle = [c for c in selection.choices if c.before <= c.after]
-                if not found.vetoed and not idle:
+                selection = asked or found.selection
+                idle = (
+                    [c for c in asked.choices if c.before <= c.after] if asked else []
+                )
+                if not idle:
                     break
                 vetoed += [(c, _IDLE) for c in idle]
-                gone = [choice.effect for choice in idle]
-                selection = without(problem, selection, *gone) if gone else selection
+                selection = without(problem, selection, *[c.effect for c in idle])
         if chosen_on is not None:
             chosen_on = problem.outcome(
                 selection.effects(), selection.start, selection.end,

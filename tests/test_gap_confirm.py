@@ -10,11 +10,12 @@ from test_gap_forward import Columns, directions
 from makebreak.gap.confirm import acts_on, confirmed, is_worse, judge_of
 from makebreak.gap.fit import fit_effects
 from makebreak.gap.numerics.selection import Screen
-from makebreak.gap.problem import Outcome
+from makebreak.gap.problem import Nuisances, Outcome
 from makebreak.gap.result import GapMeasure, InUnits
 from makebreak.gap.search.choice import Choice, Selection
 from makebreak.gap.search.chosen_by_simulation import above_step
-from makebreak.gap.search.select import with_errors_of
+from makebreak.gap.search.comparison import Comparison
+from makebreak.gap.search.drop import drop_needless, with_errors
 from makebreak.gap.verdict import Facts, decide, too_weak
 from makebreak.models.effects.kind import Effect
 
@@ -307,10 +308,26 @@ def test_what_an_effect_explains_is_asked_beside_all_that_stays():
     """The figures of the report: errors with all effects, and without each."""
     problem = Held({j: (9.0, 1.0) for j in JOINTS})
     stale = selection_of(problem)
-    selection = with_errors_of(problem, stale)
+    selection = with_errors(problem, stale)
     screen = selection.screen(problem)
     assert {c.after for c in selection.choices} == {stale.end.score}
     for k, choice in enumerate(selection.choices):
         rest = [e for i, e in enumerate(selection.effects()) if i != k]
         exact = fit_effects(problem, screen, rest).score
         assert choice.before == pytest.approx(exact, rel=1e-6) and exact > choice.after
+
+
+def test_needless_effects_do_not_go_together_where_nuisances_cannot_be_so_far_off():
+    """Each of two is within what a nuisance may be; both of these together are not."""
+
+    class Nuisanced(Held):
+        def nuisances(self):
+            own = [self.of[KIND, joint][:, 0] for joint in JOINTS[1:]]
+            return Nuisances(np.stack(own, axis=1), np.full(2, 1.25), ("one", "two"))
+
+    problem = Nuisanced({j: (9.0, 1.0) for j in JOINTS})
+    selection = selection_of(problem)
+    search = Comparison(problem, lambda text: None)
+    chosen, fitted = drop_needless(search, list(selection.choices), selection.end)
+    assert [c.effect.at[0] for c in chosen][:1] == [JOINTS[0]] and len(chosen) == 2
+    assert not search.is_strained(fitted)

@@ -10,6 +10,7 @@ from makebreak.gap.problem import Candidate, Fitted, GapProblem, is_sane
 from makebreak.gap.said import called
 from makebreak.gap.search.choice import (
     Choice,
+    Selection,
     deviations_off,
     fixed_parameters,
     is_clearly_off,
@@ -89,21 +90,24 @@ def drop_needless(
     return chosen, current
 
 
-def with_errors(
-    search: Comparison, chosen: list[Choice], current: Fitted
-) -> list[Choice]:
-    """The choices with the held-out error of all of them, and of all but each, the
-    others free to first order."""
+def with_errors(problem: GapProblem, selection: Selection) -> Selection:
+    """The selection with the held-out error of all its effects, and of all but each,
+    the others free to first order: they were found one after another, and some were
+    taken back since."""
+    chosen, current = list(selection.choices), selection.end
+    if not chosen:
+        return selection
+    search = Comparison(problem, lambda text: None)
     slopes = search.slopes(chosen, current)
     after = search.screen(current.r, current.fit.train).evaluate(current.r).score
     out = []
     for k, choice in enumerate(chosen):
         try:
-            before, _ = _by_columns(search, search.problem, current, slopes, [k])
+            before, _ = _by_columns(search, problem, current, slopes, [k])
         except ValueError:  # What is left would be no scene.
             before = float("inf")
         out.append(replace(choice, before=before, after=after))
-    return out
+    return replace(selection, choices=tuple(out))
 
 
 def _by_columns(

@@ -34,12 +34,7 @@ from makebreak.gap.search.choice import (
     refreshed,
 )
 from makebreak.gap.search.comparison import Comparison
-from makebreak.gap.search.drop import (
-    drop_needless,
-    keep_certain,
-    simplify,
-    with_errors,
-)
+from makebreak.gap.search.drop import drop_needless, keep_certain, simplify
 from makebreak.gap.search.forward import forward
 from makebreak.gap.search.rivals import (
     still_tied,
@@ -131,13 +126,3 @@ def without(problem: GapProblem, selection: Selection, *effects: Effect) -> Sele
         except (ValueError, RuntimeError):
             pass
     return replace(selection, choices=(), end=selection.start)
-
-
-def with_errors_of(problem: GapProblem, selection: Selection) -> Selection:
-    """The selection with what each effect takes off the error beside all others: they
-    were found one after another, and some were taken back since."""
-    if not selection.choices:
-        return selection
-    search = Comparison(problem, lambda text: None)
-    chosen = with_errors(search, list(selection.choices), selection.end)
-    return replace(selection, choices=tuple(chosen))
