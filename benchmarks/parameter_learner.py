@@ -100,30 +100,41 @@ def bar(name: str, parent: str, at: str, mass: float, centre: str, ball="", arm=
     )
 
 
-def door_world(v: dict) -> str:
+def arm_and(hinged: str, axis: str, v: dict, at: str, centre: str, box: str) -> str:
+    """A world of a two-link arm with a ball for its hand, and of a panel on a hinge."""
     mu, length = v["friction"], "0.35 0 0"
     tip = p.shape("ball", p.sphere(0.02), length, mu)
-    panel = p.shape("panel", p.box(0.03 - 2.0 * v["gap"], 0.4, 0.1), "0 0.2 0", mu)
+    panel = p.shape("panel", box, centre, mu)
     return p.sdf(
         bar("upper", "world", "0 0 0", 2.0, "0.175 0 0"),
-        turning("upper", "world", "0 0 1", 0.5),
+        turning("upper", "world", axis, 0.5),
         bar("fore", "upper", length, 1.6, "0.19 0 0", tip),
-        turning("fore", "upper", "0 0 1", 0.5),
-        bar("door", "world", "0.5 -0.2 0", v["mass"], "0 0.2 0", panel, 0.12),
-        turning("door", "world", "0 0 1", v["damping"], driven=False),
+        turning("fore", "upper", axis, 0.5),
+        bar(hinged, "world", at, v["mass"], centre, panel, 0.12),
+        turning(hinged, "world", axis, v["damping"], driven=False),
     )
+
+
+def of_hinged(name: str) -> dict[str, Parameter]:
+    """What may be wrong of it."""
+    return {
+        "mass": Parameter("mass", 0.5, name),
+        "damping": Parameter("damping", 0.5, f"{name}_joint"),
+        "friction": Parameter("friction", 0.5, pairs=[0]),
+        "gap": Parameter("gap", 0.003, pairs=[0]),
+    }
+
+
+def door_world(v: dict) -> str:
+    box = p.box(0.03 - 2.0 * v["gap"], 0.4, 0.1)
+    return arm_and("door", "0 0 1", v, "0.5 -0.2 0", "0 0.2 0", box)
 
 
 DOOR = Task(
     "door", door_world,
     lambda v: [ContactPair("fore", "door", v["friction"], 1, plane_normal=[0, 0, 1])],
     {"mass": 2.0, "damping": 0.8, "friction": 0.4, "gap": 0.0},
-    {
-        "mass": Parameter("mass", 0.5, "door"),
-        "damping": Parameter("damping", 0.5, "door_joint"),
-        "friction": Parameter("friction", 0.5, pairs=[0]),
-        "gap": Parameter("gap", 0.003, pairs=[0]),
-    },
+    of_hinged("door"),
     [1.0, -2.0, 0.0], [0.4, -0.2, -0.5, 0.0, 0.0, 0.0],
     [0.0, 0.0, 300.0, 5.0, 5.0, 10.0], [0.02] * 2, 2, "mrad", N=20, careful=[2],
 )  # fmt: skip
@@ -158,29 +169,15 @@ def reaching(x: float, z: float) -> list[float]:
 
 
 def lid_world(v: dict) -> str:
-    mu, length = v["friction"], "0.35 0 0"
-    tip = p.shape("ball", p.sphere(0.02), length, mu)
-    panel = p.shape("panel", p.box(0.4, 0.1, 0.03 - 2.0 * v["gap"]), "-0.2 0 0", mu)
-    return p.sdf(
-        bar("upper", "world", "0 0 0", 2.0, "0.175 0 0"),
-        turning("upper", "world", "0 1 0", 0.5),
-        bar("fore", "upper", length, 1.6, "0.19 0 0", tip),
-        turning("fore", "upper", "0 1 0", 0.5),
-        bar("lid", "world", "0.75 0 0.3", v["mass"], "-0.2 0 0", panel, 0.12),
-        turning("lid", "world", "0 1 0", v["damping"], driven=False),
-    )
+    box = p.box(0.4, 0.1, 0.03 - 2.0 * v["gap"])
+    return arm_and("lid", "0 1 0", v, "0.75 0 0.3", "-0.2 0 0", box)
 
 
 LID = Task(
     "lid", lid_world,
     lambda v: [p.in_plane("fore", "lid", v["friction"])],
     {"mass": 2.0, "damping": 0.8, "friction": 0.4, "gap": 0.0},
-    {
-        "mass": Parameter("mass", 0.5, "lid"),
-        "damping": Parameter("damping", 0.5, "lid_joint"),
-        "friction": Parameter("friction", 0.5, pairs=[0]),
-        "gap": Parameter("gap", 0.003, pairs=[0]),
-    },
+    of_hinged("lid"),
     [*reaching(0.42, 0.25), 0.0], [*reaching(0.42, 0.4), 0.4, 0.0, 0.0, 0.0],
     [0.0, 0.0, 300.0, 5.0, 5.0, 10.0], [0.002] * 2, 2, "mrad", N=20,
 )  # fmt: skip

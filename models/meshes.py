@@ -97,6 +97,11 @@ def coarse(path: Path, cells: int = 48) -> tuple[np.ndarray, np.ndarray]:
 
     Raises: ValueError for a file that holds no triangles that can be read.
     """
+    return _coarse(path, path.stat().st_mtime_ns, cells)
+
+
+@lru_cache(maxsize=256)
+def _coarse(path: Path, changed: int, cells: int) -> tuple[np.ndarray, np.ndarray]:
     vertices, faces = _read(path)
     size = max(float(np.ptp(vertices, axis=0).max()), 1e-300) / cells
     cell = np.round((vertices - vertices.min(axis=0)) / size).astype(int)
