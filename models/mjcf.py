@@ -34,7 +34,9 @@ class PlainMjcf:
     keeps no place for. drives, home: {joint: ...}, home of the first keyframe (or the
     joint's reference). passive: joints that nothing drives, where actuators drive
     others alone. notes: what is left out, and what that means. left_out: number
-    of collision meshes that are not there."""
+    of collision meshes that are not there. order: (joint, or body that floats, its
+    number of positions) as qpos has them; actuators: (joint or "", gear) as ctrl has
+    them; has_ground: whether anything is fixed that can be touched."""
 
     text: str
     effects: tuple[Effect, ...] = ()
@@ -44,6 +46,9 @@ class PlainMjcf:
     gravity: tuple[float, ...] = (0.0, 0.0, -9.81)
     notes: tuple[str, ...] = ()
     left_out: int = 0
+    order: tuple[tuple[str, int], ...] = ()
+    actuators: tuple[tuple[str, float], ...] = ()
+    has_ground: bool = False
 
 
 def plain_mjcf(path: Path) -> PlainMjcf:
@@ -188,8 +193,23 @@ class _Writer:
         return PlainMjcf(
             ET.tostring(root, encoding="unicode") + "\n", tuple(self.effects), drives,
             self._home(), passive, tuple(float(x) for x in m.opt.gravity),
-            tuple(self.notes), self.left_out,
+            tuple(self.notes), self.left_out, self._order(),
+            tuple(
+                ("", 1.0) if (j := self._driven(a)) is None
+                else (self._name("joint", j), float(m.actuator_gear[a][0]))
+                for a in range(len(m.actuator_trntype))
+            ),
+            bool(np.any((m.geom_bodyid == 0) & (m.geom_contype | m.geom_conaffinity))),
         )  # fmt: skip
+
+    def _order(self) -> tuple[tuple[str, int], ...]:
+        m = self.m
+        return tuple(
+            (self._name("joint", j), 4 if m.jnt_type[j] == 1 else 1)
+            if m.jnt_type[j]
+            else (self._name("body", int(m.jnt_bodyid[j])), 7)
+            for j in range(m.njnt)
+        )
 
     def _name(self, kind: str, index: int) -> str:
         """The name of a body, joint or other element, or one by its number."""

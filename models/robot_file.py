@@ -45,7 +45,8 @@ class RobotFile:
     gives others one. notes: what
     nobody uses, and what that means. lost: {collision mesh that is not there, or cannot
     be read: where it should be, or None: its package is unknown}; lost_visuals: of
-    meshes for display. left_out: collision shapes that text lacks."""
+    meshes for display. left_out: collision shapes that text lacks. order, actuators,
+    has_ground: of MJCF, as PlainMjcf has them."""
 
     path: Path
     text: str
@@ -61,6 +62,9 @@ class RobotFile:
     lost_visuals: Mapping[str, Path | None] = field(default_factory=dict)
     left_out: int = 0
     visuals_left_out: int = 0
+    order: tuple[tuple[str, int], ...] = ()
+    actuators: tuple[tuple[str, float], ...] = ()
+    has_ground: bool = False
 
 
 def is_robot(path: Path) -> bool:
@@ -107,7 +111,8 @@ def _read(path: Path, changed: int, packages: tuple, surroundings: tuple) -> Rob
         return RobotFile(
             path, named, ".xml", plain.effects, plain.drives, plain.home,
             passive=plain.passive, gravity=plain.gravity, notes=plain.notes,
-            left_out=plain.left_out,
+            left_out=plain.left_out, order=plain.order, actuators=plain.actuators,
+            has_ground=plain.has_ground,
         )  # fmt: skip
     suffix = {"robot": ".urdf", "sdf": ".sdf"}.get(root.tagName)
     if suffix is None:

@@ -145,7 +145,7 @@ def _load_tilted(path: Path, robot):
     """The robot under gravity as its base feels it where it is turned by TILT."""
     plant = MultibodyPlant(0.0)
     Parser(plant).AddModels(str(path))
-    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName(robot.bases[0]))
+    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName([*robot.bases][0]))
     down = TILT.inv().apply([0.0, 0.0, -9.81])
     plant.mutable_gravity_field().set_gravity_vector(down)
     plant.Finalize()

@@ -87,7 +87,7 @@ def test_an_sdf_with_pybullets_own_words_is_read(tmp_path):
 <collision name="c" concave="yes"><geometry><box><size>1 1 1</size></box></geometry>
 <material/></collision></link></model></world></sdf>""")
     own = read_robot(path)
-    assert [j.name for j in own.joints] == ["g.base_joint"] and own.bases == ()
+    assert [j.name for j in own.joints] == ["g.base_joint"] and not own.bases
     (note,) = own.file.notes
     assert note == (
         "<contact> of a link, <material> of a collision, concave of a collision: "
@@ -453,7 +453,7 @@ def test_a_link_called_world_is_the_world(tmp_path):
     )  # fmt: skip
     path.write_text(path.read_text().replace('<link name="base"/>', ""))
     own = read_robot(path)
-    assert own.bases == () and len(own.joints) == 2
+    assert not own.bases and len(own.joints) == 2
     (tmp_path / "scene.yaml").write_text(proposal_of(tmp_path, path).scene)
     loaded = load_scene(tmp_path / "scene.yaml", DiagramBuilder())
     assert loaded.plant.num_positions() == 2

@@ -1,4 +1,5 @@
-"""Where a robot's base is, by its pose in the log: of an IMU, a tracker, a simulator.
+"""Where a robot's base or an object is, by its pose in the log: of an IMU, a tracker, a
+simulator.
 
 A quaternion is four columns of unit length, whatever their names; else roll, pitch and
 yaw, or gravity's direction in the base, tell how it stands.
@@ -12,6 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from makebreak.gap.data.arrays import words_of
+from makebreak.gap.data.recording import QUATERNION
 
 # Moves less than this: it is on a stand, hung up, or screwed down.
 _STILL_RAD, _STILL_M = 0.05, 0.02
@@ -22,7 +24,9 @@ _NOT = set(
     "cmd command commands target desired des ref goal ee tool hand tcp gripper object "
     "ball box camera cam foot feet tip contact head wrist joint joints dof".split()
 )
+_OBJECT = set("object obj ball box body cube block item part puck".split())
 _TURNS = set("quat quaternion orientation rot rotation attitude pose".split())
+_UNIT = re.compile(r"[^a-z0-9](mm|cm|m)\W*")  # Behind a place's name.
 _ENTRY = re.compile(
     r"(.*?)[^a-z0-9]*?(q?[wxyz]|roll|pitch|yaw|\d+)"
     r"([^a-z0-9]+(deg|degrees|rad|radians|m|mm))?[^a-z0-9]*"
@@ -33,7 +37,8 @@ _ENTRY = re.compile(
 class BasePose:
     """orientation: scalar first, of the base in world, on the middle of the log;
     position [m], zeros where the log has none. turned [rad], moved [m]: the most but
-    for a twentieth of the rows. columns: all that were used. says: how it was read."""
+    for a twentieth of the rows. columns: all that were used. says: how it was read.
+    channels: (column, x to qz or roll to yaw, scale) of a pose that is told whole."""
 
     orientation: tuple[float, ...]
     position: tuple[float, ...]
@@ -41,6 +46,7 @@ class BasePose:
     moved: float
     columns: tuple[str, ...]
     says: str
+    channels: tuple[tuple[str, str, float], ...] = ()
 
     @property
     def is_still(self) -> bool:
@@ -51,53 +57,103 @@ class BasePose:
         return Rotation.from_quat(self.orientation, scalar_first=True)
 
 
-def base_pose(
-    logs: Sequence[Mapping[str, np.ndarray]], bases: Sequence[str]
-) -> BasePose | None:
-    """None where no log has a base's orientation.
+@dataclass(frozen=True)
+class _Sought:
+    """Whose pose is looked for. names, others: of bodies that nothing holds, each as
+    its words; words: that are said for such a body; never: in no name of its columns.
+    """
 
-    Args: logs: each {column: (n,)}; bases: names of bodies that nothing holds.
+    names: tuple[frozenset[str], ...]
+    others: tuple[frozenset[str], ...]
+    words: Collection[str]
+    never: Collection[str]
+
+    def rank(self, words: set[str]) -> int | None:
+        """0 where its own name is in it, 1 where it is one for such a body, else 2;
+        None of a name that is of something else."""
+        own, other = (max((len(n) for n in names if n and n <= words), default=0)
+                      for names in (self.names, self.others))  # fmt: skip
+        if words & self.never - {w for n in self.names for w in n} or other > own:
+            return None
+        return 0 if own else 1 if words & self.words else 2
+
+
+def base_pose(
+    logs: Sequence[Mapping[str, np.ndarray]],
+    bases: Sequence[str],
+    others: Sequence[str] = (),
+    carries: bool = True,
+) -> BasePose | None:
+    """None where no log has its orientation.
+
+    Args: logs: each {column: (n,)}; bases: names that it may have; others: those of
+        other bodies that nothing holds; carries: whether it has joints: a robot's base,
+        and no object.
     """
     if not bases:
         return None
-    first = next((c for c in logs if _orientations(c, bases)), None)
+    names, other = (tuple(frozenset(words_of(n)) for n in own)
+                    for own in (bases, others))  # fmt: skip
+    sought = _Sought(names, other, _BASE, _NOT)
+    if not carries:
+        sought = _Sought(names, other, _OBJECT, _NOT - _OBJECT)
+    first = next((c for c in logs if _orientations(c, sought)), None)
     if first is None:
         return None
-    names, kind = _orientations(first, bases)[0]
-    place = _position(first, bases)
-    have = [c for c in logs if set(names) <= set(c)]
-    turns, says = _rotations(
+    names, kind = _orientations(first, sought)[0]
+    place = _position(first, sought, not carries and not others)
+    return _pose(logs, names, kind, place)
+
+
+def listed_pose(
+    logs: Sequence[Mapping[str, np.ndarray]], place: Sequence[str], turn: Sequence[str]
+) -> BasePose:
+    """Of columns that are known: x, y and z, and w, x, y and z of the quaternion."""
+    return _pose(logs, turn, "quaternion", place)
+
+
+def _pose(logs, names: Sequence[str], kind: str, place: Sequence[str]) -> BasePose:
+    have = [c for c in logs if {*names} <= {*c}]
+    turns, says, order = _rotations(
         np.concatenate([np.stack([c[n] for n in names], axis=1) for c in have]), kind
     )
     middle = turns.mean()
     off = (middle.inv() * turns).magnitude()
     at, moved = np.zeros(3), 0.0
+    metres = [_metres(name) for name in place]
     if place:
         p = np.concatenate(
             [np.stack([c[n] for n in place], axis=1) for c in have if {*place} <= {*c}]
         )
-        p = p[np.isfinite(p).all(axis=1)]
+        p = metres * p[np.isfinite(p).all(axis=1)]
         if len(p):
             at = np.median(p, axis=0)
             moved = float(np.quantile(np.linalg.norm(p - at, axis=1), 0.95))
     w = middle.as_quat(scalar_first=True)
+    turn = np.deg2rad(1.0) if "degrees" in says else 1.0
+    parts = [*zip(place, "xyz", metres, strict=True)] if place else []
+    parts += [(n, part, turn) for n, part in zip(names, order, strict=False)]
     return BasePose(
         tuple(float(f"{x:.5g}") for x in w), tuple(float(f"{x:.5g}") for x in at),
         float(np.quantile(off, 0.95)), moved, (*names, *place),
-        f"{', '.join(names)} {says}",
+        f"{', '.join(names)} {says}", tuple(parts) if len(parts) >= 6 else (),
     )  # fmt: skip
 
 
+def _metres(name: str) -> float:
+    unit = _UNIT.search(name.lower())
+    return {"mm": 1e-3, "cm": 1e-2}.get(unit[1], 1.0) if unit else 1.0
+
+
 def _orientations(
-    columns: Mapping[str, np.ndarray], bases: Sequence[str]
+    columns: Mapping[str, np.ndarray], sought: _Sought
 ) -> list[tuple[tuple[str, ...], str]]:
-    """(columns, kind) of each, those first that have a base's name."""
+    """(columns, kind) of each, those first that have a body's own name."""
     found: list[tuple[int, int, tuple[str, ...], str]] = []
     for prefix, parts in _groups(columns).items():
         words = set(words_of(prefix))
-        if words & _NOT:
+        if (rank := sought.rank(words)) is None:
             continue
-        rank = _rank(words, bases)
         said = bool(words & _TURNS)
         for keys in (("w", "x", "y", "z"), *_counted(4)):
             own = tuple(parts[k] for k in keys if k in parts)
@@ -123,22 +179,28 @@ def _orientations(
 
 
 def _position(
-    columns: Mapping[str, np.ndarray], bases: Sequence[str]
+    columns: Mapping[str, np.ndarray], sought: _Sought, alone: bool
 ) -> tuple[str, ...]:
-    """The columns of a base's place; () where there are none."""
+    """The columns of a body's place; () where there are none. alone: nothing else has a
+    pose, so that x, y and z are it."""
+    found: list[tuple[int, tuple[str, ...]]] = []
     for prefix, parts in _groups(columns).items():
         words = set(words_of(prefix))
-        if words & (_NOT | _TURNS - {"pose"}) or _rank(words, bases) > 1:
+        rank = sought.rank(words)
+        if rank is None or rank == 2 and not alone or words & _TURNS - {"pose"}:
             continue
-        if not words & {"pos", "position", "xyz", "translation", "pose", *bases}:
+        place = {"pos", "position", "xyz", "translation", "pose"} & words
+        if not (place or rank == 0 or alone and rank < 2 or not words):
             continue
-        if words & {"vel", "velocity", "lin", "ang", "acc", "acceleration", "gravity"}:
+        if words & {"vel", "velocity", "lin", "ang", "acc", "acceleration", "gravity",
+                    "linear", "angular", "twist", "v", "omega"}:  # fmt: skip
             continue
         for keys in (("x", "y", "z"), *_counted(3)):
             own = tuple(parts[k] for k in keys if k in parts)
             if len(own) == 3 and not {"w", "3"} & set(parts):
-                return own
-    return ()
+                found.append((rank, own))
+                break
+    return min(found, key=lambda each: each[0], default=(0, ()))[1]
 
 
 def _groups(columns: Collection[str]) -> dict[str, dict[str, str]]:
@@ -160,20 +222,16 @@ def _counted(n: int) -> list[tuple[str, ...]]:
     return [tuple(str(k + first) for k in range(n)) for first in (0, 1)]
 
 
-def _rank(words: set[str], bases: Sequence[str]) -> int:
-    """0 where a base's own name is in it, 1 where it is one for a base, else 2."""
-    own = [set(words_of(base)) for base in bases]
-    return 0 if any(w and w <= words for w in own) else 1 if words & _BASE else 2
-
-
 def _rotations(rows: np.ndarray, kind: str):
-    """Rotations of the rows that are whole, and how they were taken."""
+    """Rotations of the rows that are whole, how they were taken, and what the columns
+    are of a pose."""
     y = rows[np.isfinite(rows).all(axis=1)]
     if kind == "angles":
         y = y if y.shape[1] == 3 else np.column_stack([y, np.zeros(len(y))])
         degrees = bool(np.abs(y).max() > 2.0 * np.pi)
         unit = "degrees" if degrees else "radians"
-        return Rotation.from_euler("xyz", y, degrees), f"are taken in {unit}"
+        return (Rotation.from_euler("xyz", y, degrees), f"are taken in {unit}",
+                ("roll", "pitch", "yaw"))  # fmt: skip
     if kind == "gravity":  # Down, in the base's axes; which way it looks is unknown.
         down = y / np.linalg.norm(y, axis=1)[:, None]
         # The shortest turn that takes what the base has for down to down.
@@ -181,7 +239,7 @@ def _rotations(rows: np.ndarray, kind: str):
         angle = np.arctan2(np.linalg.norm(axis, axis=1), -down[:, 2])
         size = np.maximum(np.linalg.norm(axis, axis=1), 1e-12)
         turns = Rotation.from_rotvec(axis / size[:, None] * angle[:, None])
-        return turns, "are gravity's direction in it"
+        return turns, "are gravity's direction in it", ()
     if (
         kind == "four"
     ):  # Scalar first or last: as it stands more upright, or turns less.
@@ -190,5 +248,7 @@ def _rotations(rows: np.ndarray, kind: str):
         less = [-round(float(r.mean().magnitude()), 2) for r in tried]
         last = (up[1], less[1]) > (up[0], less[0])
         shown = "x, y, z, w" if last else "w, x, y, z"
-        return tried[last], f"are taken as {shown}"
-    return Rotation.from_quat(y, scalar_first=True), "are its quaternion"
+        order = QUATERNION[1:] + QUATERNION[:1] if last else QUATERNION
+        return tried[last], f"are taken as {shown}", order
+    return (Rotation.from_quat(y, scalar_first=True), "are its quaternion",
+            QUATERNION)  # fmt: skip

@@ -1,7 +1,8 @@
 """Parts of a robot that lie in one another in a log: shapes larger than the parts are.
 
 Collision shapes are hulls and boxes around what is there. Where two of them overlap in
-poses that the robot was in, contact would push joints that nothing pushed.
+poses that the robot was in, contact would push joints that nothing pushed. Two trees of
+bodies, as a finger and a door are, or a tool and the ground, may touch.
 """
 
 import tempfile
@@ -54,7 +55,21 @@ def overlapping(
             for pair in query.ComputePointPairPenetration():
                 if pair.depth > TOUCHES:
                     frames = (inspector.GetFrameId(g) for g in (pair.id_A, pair.id_B))
-                    bodies = (plant.GetBodyFromFrameId(frame) for frame in frames)
+                    bodies = [plant.GetBodyFromFrameId(frame) for frame in frames]
+                    if len({_root(plant, b) for b in bodies}) > 1:
+                        continue  # What does not hang together may touch.
                     one, other = sorted(b.scoped_name().get_full() for b in bodies)
                     found[one, other] = None
     return list(found)
+
+
+def _root(plant, body) -> int:
+    """The body on the world, or floating, that carries another; the world's own."""
+    carried_by = {
+        int(j.child_body().index()): int(j.parent_body().index())
+        for j in map(plant.get_joint, plant.GetJointIndices())
+    }
+    at, world = int(body.index()), int(plant.world_body().index())
+    while carried_by.get(at, world) != world:
+        at = carried_by[at]
+    return at

@@ -16,7 +16,7 @@ from pydrake.multibody.tree import ModelInstanceIndex
 
 from makebreak.gap.data.arrays import is_time, words_of
 from makebreak.gap.data.bags import MotorRange, is_dataset, motor_ranges
-from makebreak.gap.data.base_pose import BasePose, base_pose
+from makebreak.gap.data.base_pose import BasePose, base_pose, listed_pose
 from makebreak.gap.data.content import (
     CLEARER,
     EXPLAINS,
@@ -28,6 +28,7 @@ from makebreak.gap.data.content import (
     left_by,
     told_by,
 )
+from makebreak.gap.data.coordinates import by_lists
 from makebreak.gap.data.findings import (
     FIXED,
     GUESSED_GAINS,
@@ -48,6 +49,7 @@ from makebreak.gap.data.proposal import (
     said_of,
     sidecar_text,
 )
+from makebreak.gap.data.recording import QUATERNION
 from makebreak.gap.data.servo_gains import (
     ServoGains,
     ServoLog,
@@ -88,25 +90,31 @@ LEAST_LOAD = 0.05  # Of a joint's rms gravity torque [N m], to tell its servo by
 @dataclass(frozen=True, eq=False)
 class Robot:
     """joints: in the order of the robot's coordinates. bases: bodies that nothing
-    holds. plant: finalized, with the bases welded to the world, where a log says, pose,
-    or upright. numbered: joints in the order in which a log counts them, if that is
-    another."""
+    holds, {name: where the file has it}. plant: finalized, with the bases welded to the
+    world, where a log says, poses, or where the file has them. free: bases that a scene
+    leaves free; carriers: those that carry joints, so no objects. numbered: joints in
+    the order in which a log counts them, if that is another. order: (joint or base, its
+    number of positions), as lists have them."""
 
     path: Path
     model: str
     joints: tuple[JointName, ...]
-    bases: tuple[str, ...]
+    bases: Mapping[str, RigidTransform]
     effort_limits: dict[str, float]
     plant: MultibodyPlant
     file: RobotFile
-    pose: BasePose | None = None
+    poses: Mapping[str, BasePose] = field(default_factory=dict)
+    free: tuple[str, ...] = ()
+    carriers: tuple[str, ...] = ()
     numbered: tuple[JointName, ...] = ()
+    order: tuple[tuple[str, int], ...] = ()
 
 
 def read_robot(path: Path) -> Robot:
     """Raises: ValueError, one line, for a file that holds no one robot."""
     floating = _load(path)
-    bases = tuple(floating.get_body(i).name() for i in floating.GetFloatingBaseBodies())
+    free = [floating.get_body(i) for i in floating.GetFloatingBaseBodies()]
+    bases = {b.name(): floating.GetDefaultFloatingBaseBodyPose(b) for b in free}
     plant = _load(path, bases)
     model = re.sub(r"\W", "_", plant.GetModelInstanceName(_instance(plant)))
     file = without_lost_collisions(path, given_packages())
@@ -124,23 +132,37 @@ def read_robot(path: Path) -> Robot:
                 min(limits[name], file.limits.get(joint.name(), np.inf)),
             )
         )
-    if not joints:
+    if not joints and not bases:
         raise ValueError(f"robot {path} has no joint that turns or slides")
-    return Robot(path, model, tuple(joints), bases, limits, plant, file)
+    at = [(j.position_start(), j.name(), 1) for j in one_dof_joints(floating)]
+    at += [(b.floating_positions_start(), b.name(), 7) for b in free]
+    order = file.order or tuple((name, n) for _, name, n in sorted(at))
+    moved = {
+        b.name(): set(floating.GetBodiesKinematicallyAffectedBy([j.index()]))
+        for j in map(floating.get_joint, floating.GetJointIndices())
+        for b in free if j.child_body().index() == b.index()
+    }  # fmt: skip
+    carriers = tuple(
+        name for name, own in moved.items()
+        if any(j.child_body().index() in own for j in one_dof_joints(floating))
+    )  # fmt: skip
+    return Robot(
+        path, model, tuple(joints), bases, limits, plant, file, carriers=carriers,
+        order=order,
+    )  # fmt: skip
 
 
 def _load(
     path: Path,
-    welded: Sequence[str] = (),
+    welded: Mapping[str, RigidTransform] | None = None,
     fixed: Mapping[str, float] | None = None,
-    pose: BasePose | None = None,
 ) -> MultibodyPlant:
-    """fixed: {joint, without the model's name: where it stands}; pose: of what is
-    welded."""
+    """welded: {body: its pose in world}; fixed: {joint, without the model's name: where
+    it stands}."""
     file = without_lost_collisions(path, given_packages())
 
     def of(text: str) -> MultibodyPlant:
-        return _plant(path, file, text, welded, fixed, pose)
+        return _plant(path, file, text, welded or {}, fixed)
 
     plant = of(file.text)
     if file.suffix != ".xml":
@@ -153,7 +175,7 @@ def _load(
     return plant
 
 
-def _plant(path: Path, file: RobotFile, text: str, welded, fixed, pose):
+def _plant(path: Path, file: RobotFile, text: str, welded, fixed):
     plant = MultibodyPlant(0.0)
     plant.mutable_gravity_field().set_gravity_vector(file.gravity)
     try:
@@ -163,9 +185,8 @@ def _plant(path: Path, file: RobotFile, text: str, welded, fixed, pose):
             models = parser.AddModelsFromString(text, file.suffix[1:])
         if len(models) != 1:
             raise ValueError(f"it holds {len(models)} models, expected one")
-        for base in welded:
-            frame = plant.GetFrameByName(base)
-            plant.WeldFrames(plant.world_frame(), frame, _transform(pose))
+        for base, X in welded.items():
+            plant.WeldFrames(plant.world_frame(), plant.GetFrameByName(base), X)
         model = plant.GetModelInstanceName(models[0])
         there = {f"{model}.{name}": q for name, q in (fixed or {}).items()}
         fix_joints(plant, there, len(couplings_in(file.text)))
@@ -180,10 +201,13 @@ def _plant(path: Path, file: RobotFile, text: str, welded, fixed, pose):
     return plant
 
 
-def _transform(pose: BasePose | None) -> RigidTransform:
-    if pose is None:
-        return RigidTransform()
-    return RigidTransform(RotationMatrix(pose.rotation.as_matrix()), pose.position)
+def _poses(robot: Robot) -> dict[str, RigidTransform]:
+    """Of its bases, as logs have them or else its file."""
+    return {
+        name: X if (pose := robot.poses.get(name)) is None
+        else RigidTransform(RotationMatrix(pose.rotation.as_matrix()), pose.position)
+        for name, X in robot.bases.items()
+    }  # fmt: skip
 
 
 def _instance(plant: MultibodyPlant):
@@ -248,7 +272,7 @@ def _with_fixed(robot: Robot, fixed: Mapping[str, float]) -> Robot:
     return replace(
         robot,
         joints=tuple(j for j in robot.joints if j.name not in fixed),
-        plant=_load(robot.path, robot.bases, names, robot.pose),
+        plant=_load(robot.path, _poses(robot), names),
     )
 
 
@@ -289,6 +313,9 @@ def read_log(
 def matches_of(log: Log, robot: Robot | None) -> list[Match]:
     joints = () if robot is None else robot.numbered or robot.joints
     said = said_of(log.own.get("columns") or {})
+    if robot is not None:
+        columns, file = log.table.columns, robot.file
+        said = by_lists(columns, robot.model, robot.order, file.actuators) | said
     return propose(log.table.columns, joints, log.text, said, log.ranges)
 
 
@@ -397,26 +424,21 @@ def judge_logs(robot: Robot, logs: Sequence[Log]) -> Judged:
     said: list[Said] = []
     robot = _numbered(robot, logs, said)
     every = {log.path: _named(log, robot, said) for log in logs}
-    pose = (
-        base_pose([_of_no_joint(log, every[log.path]) for log in logs], robot.bases)
-        if robot.bases
-        else None
-    )
-    if pose is not None:
-        plant = _load(robot.path, robot.bases, pose=pose)
-        robot = replace(robot, plant=plant, pose=pose)
-        every = {path: _without_pose(pose, own) for path, own in every.items()}
+    robot = _with_poses(robot, logs, every)
+    every = {path: _of_bodies(robot, own) for path, own in every.items()}
     unused = dict.fromkeys(m.column for matches in every.values() for m in matches
                            if m.why.endswith(UNKNOWN_JOINT))  # fmt: skip
     every = {path: _through_gears(robot, own) for path, own in every.items()}
-    if pose is not None and not pose.is_still:
+    for base, pose in robot.poses.items():
+        if base in robot.free or pose.is_still:
+            continue
         says = (
-            f"{robot.bases[0]}, the base, moves by {_moves(pose)} in the log, and the "
+            f"{base}, the base, moves by {_moves(pose)} in the log, and the "
             "proposed scene holds it where it was on average: what its motion does to "
             "the joints is not in the model. Use logs of it on a stand, or a scene in "
             "which it is free, with what it stands on."
         )
-        said.append(Said(BASE_MOVES, robot.bases[0], pose.turned, says))
+        said.append(Said(BASE_MOVES, base, pose.turned, says))
     said += _maybe_of_a_range(logs, every)
     for matches in every.values():
         said += [Said(*each) for each in said_of_units(matches)]
@@ -547,13 +569,57 @@ def _of_no_joint(log: Log, matches: Sequence[Match]) -> dict[str, np.ndarray]:
     return {k: y for k, y in log.table.columns.items() if k not in said}
 
 
-def _without_pose(pose: BasePose, matches: Sequence[Match]) -> list[Match]:
-    """Without columns of the base's pose, where it is welded."""
-    why = "the base's pose: it is welded there"
-    return [
-        Match(m.column, None, why=why)
-        if m.column in pose.columns and m.why != AS_SAID else m for m in matches
-    ]  # fmt: skip
+def _with_poses(robot: Robot, logs: Sequence[Log], every) -> Robot:
+    """With its bases where logs have them. Free are objects whose poses are in all
+    logs, and a robot's base that moves on what its file has for it to stand on."""
+    columns = [_of_no_joint(log, every[log.path]) for log in logs]
+    poses, free = dict[str, BasePose](), list[str]()
+    for base in robot.bases:
+        at = f"{robot.model}.{base}"
+        told = {m.channel: m.column for m in every[logs[0].path] if m.channel}
+        place, turn = (
+            [told[f"{at}.{part}"] for part in parts if f"{at}.{part}" in told]
+            for parts in ("xyz", QUATERNION)
+        )
+        carries = base in robot.carriers
+        pose: BasePose | None
+        if len(place) == 3 and len(turn) == 4:
+            pose = listed_pose([log.table.columns for log in logs], place, turn)
+        else:
+            others = [other for other in robot.bases if other != base]
+            pose = base_pose(columns, [base], others, carries)
+        if pose is None:
+            continue
+        poses[base] = pose
+        whole = pose.channels and all({*pose.columns} <= {*log.table.columns}
+                                      for log in logs)  # fmt: skip
+        if whole and (not carries or robot.file.has_ground and not pose.is_still):
+            free.append(base)
+    if not poses:
+        return robot
+    robot = replace(robot, poses=poses, free=tuple(free))
+    return replace(robot, plant=_load(robot.path, _poses(robot)))
+
+
+def _of_bodies(robot: Robot, matches: Sequence[Match]) -> list[Match]:
+    """With columns of poses as those of bodies that are free, and without those of what
+    is welded."""
+    of = {
+        column: (base, part, scale)
+        for base, pose in robot.poses.items()
+        for column, part, scale in pose.channels or [(c, "", 1.0) for c in pose.columns]
+    }
+    out = []
+    for match in matches:
+        base, part, scale = of.get(match.column, ("", "", 1.0))
+        if base and match.why != AS_SAID:
+            why = "the base's pose: it is welded there"
+            channel = None
+            if base in robot.free:
+                why, channel = f"the pose of {base}", f"{robot.model}.{base}.{part}"
+            match = Match(match.column, channel, scale, why=why)
+        out.append(match)
+    return out
 
 
 def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
@@ -576,12 +642,16 @@ def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
                 f"{stem_of(path)}.yaml: columns: {{NAME: time}}, or say there how many "
                 "rows a second has: rate_hz: 100"
             )
-        if not any(c.endswith(".position") for c in channels):
+        if not robot.free and not any(c.endswith(".position") for c in channels):
             shown = ", ".join(m.column for m in matches[:8])
             names = ", ".join(j.name.split(".", 1)[1] for j in robot.joints)
+            what = (
+                f"position of a joint of {robot.path.name} ({names})" if names else
+                f"pose of a body of {robot.path.name} ({', '.join(robot.bases)})"
+            )  # fmt: skip
             raise ValueError(
-                f"recording {path}: no column looks like the position of a joint of "
-                f"{robot.path.name} ({names}), it has {shown}; write it in a sidecar"
+                f"recording {path}: no column looks like the {what}, it has {shown}; "
+                "write it in a sidecar"
             )
         for channel in sorted(channels):
             at, _, what = channel.rpartition(".")
@@ -675,29 +745,34 @@ def directives_of(robot: Robot) -> tuple[list[str], dict[str, str], list[str]]:
 
 def _welds(robot: Robot) -> tuple[list[str], list[str]]:
     """Lines that hold the robot's bases, and what is to be said of it."""
-    lines, notes, pose = [], [], robot.pose
-    for base in robot.bases:
-        weld = f"- add_weld: {{parent: world, child: {robot.model}::{base}"
-        if pose is None:
-            lines.append(f"{weld}}}  # It stands level on the world's origin.")
+    lines, notes = [], []
+    for base, X in _poses(robot).items():
+        if base in robot.free:
+            notes.append(f"{base} moves freely: its pose is in the log")
+            continue
+        weld, pose = f"- add_weld: {{parent: world, child: {robot.model}::{base}", ""
+        known = robot.poses.get(base)
+        if not X.IsExactlyIdentity():
+            turn = X.rotation().ToAngleAxis()
+            angle = float(np.rad2deg(turn.angle()))
+            axis = [float(f"{x:.6g}") for x in turn.axis()]
+            pose = (
+                f", X_PC: {{translation: {[float(x) for x in X.translation()]}, "
+                f"rotation: !AngleAxis {{angle_deg: {angle:.5g}, axis: {axis}}}}}"
+            )
+        if known is None:
+            lines.append(f"{weld}{pose}}}  # As the robot's file has it.")
             notes.append(
                 f"{base} is welded to the world, level, as no column has its pose: if "
                 "it was tilted, hung over or moved, turn it in the scene's add_weld "
                 "(X_PC)"
             )
             continue
-        turn = pose.rotation.as_rotvec(degrees=True)
-        angle = float(np.linalg.norm(turn))
-        axis = [float(f"{x:.6g}") for x in turn / max(angle, 1e-12)]
-        if angle < 1e-3:
-            axis = [0.0, 0.0, 1.0]
-        lines.append(
-            f"{weld}, X_PC: {{translation: {list(pose.position)}, rotation: "
-            f"!AngleAxis {{angle_deg: {angle:.5g}, axis: {axis}}}}}}}  # As in the log."
-        )
+        lines.append(f"{weld}{pose}}}  # As in the log.")
         notes.append(
             f"{base} is welded to the world at the pose that the log has of it, turned "
-            f"by {angle:.3g} deg ({pose.says}); it moves by {_moves(pose)} there"
+            f"by {np.rad2deg(known.rotation.magnitude()):.3g} deg ({known.says}); it "
+            f"moves by {_moves(known)} there"
         )
     return lines, notes
 
