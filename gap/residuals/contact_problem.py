@@ -26,6 +26,7 @@ from makebreak.gap.problem import (
 )
 from makebreak.gap.residuals.contact_candidates import ContactCandidates
 from makebreak.gap.residuals.contact_dynamics import OF_ROBOTS, WRENCHED
+from makebreak.gap.residuals.contact_means import SLIDES
 from makebreak.gap.residuals.lying_on_faces import lying_on_faces
 from makebreak.gap.residuals.mechanism import link_changes
 from makebreak.gap.residuals.mechanism_candidates import tolerances
@@ -99,11 +100,13 @@ class ContactProblem(ContactCandidates, GapProblem):
         scene: Scene,
         recordings: Sequence[Recording],
         learned: "ContactProblem | None" = None,
+        slides: float = SLIDES,
     ):
         """Args: learned: a problem of the same scene with other recordings, of which
         stays what models are off by and what sensors feel; None: both are learned of
-        these.
+        these. slides: slower slip [m/s] may be sticking.
         """
+        self.slides = slides if learned is None else learned.slides
         self._scalable: dict[str, bool] = {}
         # By how much bodies' poses were moved earlier before this (late_poses.py) [s],
         # and the error before and with that.
