@@ -57,6 +57,7 @@ from makebreak.gap.simulation.measure import (
 )
 from makebreak.gap.thresholds import AGREEMENT_RMS_MAX
 from makebreak.models.effects import KINDS
+from makebreak.models.effects.contact_damper import STICTION
 from makebreak.models.effects.kind import Effect, sliding_joints
 from makebreak.models.effects.objects import MASS
 from makebreak.models.scene import Scene
@@ -626,10 +627,11 @@ class ContactProblem(ContactCandidates, GapProblem):
         self, effects, start: Fitted, end: Fitted, nuisances: Nuisances,
         recordings=None, jobs: int = 1,
     ) -> Outcome | None:  # fmt: skip
+        creep = self.slides if self.slides > SLIDES else STICTION
         if recordings is not None:
             try:
                 model = PushWindows(
-                    self.scene, recordings, lying=self.lying(), pairs=self.pressed()
+                    self.scene, recordings, None, self.lying(), self.pressed(), creep
                 )
             except DoesNotFit:  # No window fits in.
                 return None
@@ -644,7 +646,7 @@ class ContactProblem(ContactCandidates, GapProblem):
                 try:
                     self._windows = PushWindows(
                         self.scene, self.recordings, episodes, self.lying(),
-                        self.pressed(),
+                        self.pressed(), creep,
                     )  # fmt: skip
                 except DoesNotFit:
                     return None
