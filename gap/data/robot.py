@@ -446,7 +446,7 @@ def judge_logs(robot: Robot, logs: Sequence[Log]) -> Judged:
     if fixed:
         robot = _with_fixed(robot, fixed)
         every = {path: _left_out(matches, fixed) for path, matches in every.items()}
-    for log in logs:
+    for log in logs if robot.joints else ():
         matches, more = by_content(
             robot.plant, robot.joints, log.table.columns, every[log.path]
         )
@@ -503,7 +503,7 @@ def _numbered(robot: Robot, logs: Sequence[Log], said: list[Said]) -> Robot:
     }
     others = {word: other for word, other in others.items()
               if [m.channel for m in matches_of(logs[0], other)] != first}  # fmt: skip
-    if not others:
+    if not others or not robot.joints:
         return robot
     each = {word: left(other) for word, other in others.items()}
     word = min(each, key=lambda word: each[word])
@@ -1055,7 +1055,7 @@ def _untold(
 def _motions(robot: Robot, every, logs) -> list[ServoLog]:
     """Of each log in which all joints are measured."""
     motions = []
-    for log in logs:
+    for log in logs if robot.joints else ():
         channels = _scaled(log, every[log.path])
         if not {"time", *(f"{j.name}.position" for j in robot.joints)} <= {*channels}:
             continue
