@@ -330,6 +330,8 @@ def _compared(
         made = _pressing_problem if pressing else _contact_problem
         say("preparing contacts that creep")
         other, found = made(scene, decided, CREEP)
+        if other.rich_left > AGREEMENT_RMS_MAX:  # Nor does all that is ordinary then.
+            return problem, selection, result
         say("searching the catalogue with contacts that creep")
         then = select(other, say)
         with budget.part(CONCLUDE):

@@ -7,6 +7,7 @@ only what it reads exactly: bodies, explicit inertias, joints, shapes.
 
 from collections.abc import Container, Sequence
 from dataclasses import dataclass, field
+from itertools import combinations
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -36,7 +37,9 @@ class PlainMjcf:
     others alone. notes: what is left out, and what that means. left_out: number
     of collision meshes that are not there. order: (joint, or body that floats, its
     number of positions) as qpos has them; actuators: (joint or "", gear) as ctrl has
-    them; has_ground: whether anything is fixed that can be touched."""
+    them; has_ground: whether anything is fixed that can be touched. frictions: (body,
+    other one, coefficient) of pairs for which Drake makes another one of the two
+    shapes' (MuJoCo takes the larger)."""
 
     text: str
     effects: tuple[Effect, ...] = ()
@@ -49,6 +52,7 @@ class PlainMjcf:
     order: tuple[tuple[str, int], ...] = ()
     actuators: tuple[tuple[str, float], ...] = ()
     has_ground: bool = False
+    frictions: tuple[tuple[str, str, float], ...] = ()
 
 
 def plain_mjcf(path: Path) -> PlainMjcf:
@@ -200,7 +204,32 @@ class _Writer:
                 for a in range(len(m.actuator_trntype))
             ),
             bool(np.any((m.geom_bodyid == 0) & (m.geom_contype | m.geom_conaffinity))),
+            self._frictions(),
         )  # fmt: skip
+
+    def _frictions(self) -> tuple[tuple[str, str, float], ...]:
+        """Of a body's shapes the one with most friction counts."""
+        m = self.m
+        of: dict[int, tuple[int, float]] = {}  # {body: (priority, friction)}
+        for g in np.flatnonzero(m.geom_contype | m.geom_conaffinity):
+            own = int(m.geom_priority[g]), float(m.geom_friction[g][0])
+            of[int(m.geom_bodyid[g])] = max(own, of.get(int(m.geom_bodyid[g]), own))
+        found, beyond = [], set[int]()
+        for (a, one), (b, two) in combinations(sorted(of.items()), 2):
+            if m.body_weldid[a] == m.body_weldid[b]:
+                continue
+            mu = max(one, two)[1] if one[0] != two[0] else max(one[1], two[1])
+            total = one[1] + two[1]
+            drake = 2.0 * one[1] * two[1] / total if total else 0.0
+            # An effect then gives both surfaces another friction, so that what these
+            # have with others has to be said, too.
+            beyond |= {a, b} if mu >= 2.0 * min(one[1], two[1]) else set()
+            found.append((a, b, mu, not np.isclose(mu, drake)))
+        return tuple(
+            (*("" if k == 0 else self._name("body", k) for k in (a, b)), mu)
+            for a, b, mu, differs in sorted(found, key=lambda each: -each[2])
+            if differs or {a, b} & beyond
+        )
 
     def _order(self) -> tuple[tuple[str, int], ...]:
         m = self.m

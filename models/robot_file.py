@@ -46,7 +46,7 @@ class RobotFile:
     nobody uses, and what that means. lost: {collision mesh that is not there, or cannot
     be read: where it should be, or None: its package is unknown}; lost_visuals: of
     meshes for display. left_out: collision shapes that text lacks. order, actuators,
-    has_ground: of MJCF, as PlainMjcf has them."""
+    has_ground, frictions: of MJCF, as PlainMjcf has them."""
 
     path: Path
     text: str
@@ -65,6 +65,7 @@ class RobotFile:
     order: tuple[tuple[str, int], ...] = ()
     actuators: tuple[tuple[str, float], ...] = ()
     has_ground: bool = False
+    frictions: tuple[tuple[str, str, float], ...] = ()
 
 
 def is_robot(path: Path) -> bool:
@@ -112,7 +113,7 @@ def _read(path: Path, changed: int, packages: tuple, surroundings: tuple) -> Rob
             path, named, ".xml", plain.effects, plain.drives, plain.home,
             passive=plain.passive, gravity=plain.gravity, notes=plain.notes,
             left_out=plain.left_out, order=plain.order, actuators=plain.actuators,
-            has_ground=plain.has_ground,
+            has_ground=plain.has_ground, frictions=plain.frictions,
         )  # fmt: skip
     suffix = {"robot": ".urdf", "sdf": ".sdf"}.get(root.tagName)
     if suffix is None:

@@ -115,8 +115,9 @@ def listed_pose(
 def _pose(logs, names: Sequence[str], kind: str, place: Sequence[str]) -> BasePose:
     have = [c for c in logs if {*names} <= {*c}]
     turns, says, order = _rotations(
-        np.concatenate([np.stack([c[n] for n in names], axis=1) for c in have]), kind
-    )
+        np.concatenate([np.stack([c[n] for n in names], axis=1) for c in have]), kind,
+        any("deg" in words_of(n) for n in names),
+    )  # fmt: skip
     middle = turns.mean()
     off = (middle.inv() * turns).magnitude()
     at, moved = np.zeros(3), 0.0
@@ -130,7 +131,7 @@ def _pose(logs, names: Sequence[str], kind: str, place: Sequence[str]) -> BasePo
             at = np.median(p, axis=0)
             moved = float(np.quantile(np.linalg.norm(p - at, axis=1), 0.95))
     w = middle.as_quat(scalar_first=True)
-    turn = np.deg2rad(1.0) if "degrees" in says else 1.0
+    turn = float(np.deg2rad(1.0)) if "degrees" in says else 1.0
     parts = [*zip(place, "xyz", metres, strict=True)] if place else []
     parts += [(n, part, turn) for n, part in zip(names, order, strict=False)]
     return BasePose(
@@ -222,13 +223,13 @@ def _counted(n: int) -> list[tuple[str, ...]]:
     return [tuple(str(k + first) for k in range(n)) for first in (0, 1)]
 
 
-def _rotations(rows: np.ndarray, kind: str):
+def _rotations(rows: np.ndarray, kind: str, degrees: bool):
     """Rotations of the rows that are whole, how they were taken, and what the columns
-    are of a pose."""
+    are of a pose. degrees: said of angles."""
     y = rows[np.isfinite(rows).all(axis=1)]
     if kind == "angles":
         y = y if y.shape[1] == 3 else np.column_stack([y, np.zeros(len(y))])
-        degrees = bool(np.abs(y).max() > 2.0 * np.pi)
+        degrees |= bool(np.abs(y).max() > 2.0 * np.pi)
         unit = "degrees" if degrees else "radians"
         return (Rotation.from_euler("xyz", y, degrees), f"are taken in {unit}",
                 ("roll", "pitch", "yaw"))  # fmt: skip

@@ -33,6 +33,8 @@ def layouts(
 
     Args: columns {name: (n,)} and their matches; joints in the robot's order.
     """
+    if not joints:
+        return []
     n, stems = len(joints), [_stem(m.column) for m in matches]
     states = {s for m, s in zip(matches, stems, strict=True)
               if m.why.endswith(UNKNOWN_JOINT) and stems.count(s) >= 2 * n}  # fmt: skip

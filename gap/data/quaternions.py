@@ -1,11 +1,30 @@
-"""Quaternions of a table: unit length, and one sign without jumps."""
+"""Quaternions of a table: of angles, unit length, and one sign without jumps."""
 
 from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from makebreak.gap.data.recording import QUATERNION, Episode
+from makebreak.gap.data.table import ANGLES
+
+
+def with_quaternions(columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Columns with quaternions in the place of roll, pitch and yaw [rad], which turn
+    about the world's x, y and z, in this order; one that is not there is 0."""
+    out = {k: y for k, y in columns.items() if k.rpartition(".")[2] not in ANGLES}
+    for at in dict.fromkeys(k.rpartition(".")[0] for k in columns if k not in out):
+        some = [columns.get(f"{at}.{angle}") for angle in ANGLES]
+        none = np.zeros_like(next(y for y in some if y is not None))
+        xyz = np.stack([none if y is None else y for y in some], axis=1)
+        q = np.full((len(none), 4), np.nan)
+        there = np.isfinite(xyz).all(axis=1)
+        if there.any():
+            turns = Rotation.from_euler("xyz", xyz[there])
+            q[there] = turns.as_quat(scalar_first=True)
+        out |= {f"{at}.{key}": q[:, k].copy() for k, key in enumerate(QUATERNION)}
+    return out
 
 
 def mend_quaternions(

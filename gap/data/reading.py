@@ -18,7 +18,7 @@ from makebreak.gap.data.episodes import (
 )
 from makebreak.gap.data.filters import read_filter
 from makebreak.gap.data.joined import read_joined
-from makebreak.gap.data.quaternions import mend_quaternions
+from makebreak.gap.data.quaternions import mend_quaternions, with_quaternions
 from makebreak.gap.data.recording import Channel, Episode, Recording
 from makebreak.gap.data.sidecar import read_sidecars, renamed, sidecar_of
 from makebreak.gap.data.stamps import mended
@@ -113,6 +113,7 @@ def read_recording(
     episodes, more = without_ignored(path, episodes, time, spans)
     notes = [*done, *notes, *more, *_without_empty(path, columns)]
     notes += _without_turns(path, columns, episodes, slides)
+    columns = with_quaternions(columns)
     flips, norm_errors = mend_quaternions(path, columns, episodes, row)
     if is_excerpt:
         says = f"{path.name} has {n_rows} rows, too many to hold: {len(time)} of them "

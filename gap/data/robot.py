@@ -59,6 +59,7 @@ from makebreak.gap.data.servo_gains import (
 )
 from makebreak.gap.data.sidecar import Found, read_sidecars, sidecar_for
 from makebreak.gap.data.table import (
+    JOINT_QUANTITIES,
     RecordingTable,
     is_channel,
     stem_of,
@@ -563,7 +564,8 @@ def _of_no_joint(log: Log, matches: Sequence[Match]) -> dict[str, np.ndarray]:
     name of a joint (Left_Shoulder_Roll is no roll of a base)."""
     said = set(log.own.get("columns") or {})
     for m in matches:
-        joint = (m.channel or "").rpartition(".")[0].partition(".")[2]
+        at, _, what = (m.channel or "").rpartition(".")
+        joint = at.partition(".")[2] if what in JOINT_QUANTITIES else ""
         if joint and {*words_of(joint)} <= {*words_of(m.column)}:
             said.add(m.column)
     return {k: y for k, y in log.table.columns.items() if k not in said}
@@ -794,6 +796,16 @@ def _effects_of_file(robot: Robot, fixed, lines: Sequence[str]) -> list[str]:
             f"- {{kind: {effect.kind}, at: {at}, parameters: {{{values}}}}}"
             "  # From the file."
         )
+    for *two, friction in robot.file.frictions:
+        if set(two) & set(robot.free):
+            ends = (
+                f"{robot.model}.{b}" if b else "WorldModelInstance.world"
+                for b in sorted(two, key=lambda b: b not in robot.free)
+            )
+            out.append(
+                f'- {{kind: contact_friction, at: "{"~".join(ends)}", parameters: '
+                f"{{friction: {friction!r}}}}}  # From the file: MuJoCo's larger one."
+            )
     if out and not any(line.startswith("effects:") for line in lines):
         out.insert(0, "effects:")
     return out

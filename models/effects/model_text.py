@@ -74,7 +74,8 @@ def _edit_mjcf(
     effect: Effect,
     edit: Callable[[Effect, minidom.Element], None],
 ) -> None:
-    """Makes the edit to a body's `inertial`, which has a `fullinertia` (mjcf.py)."""
+    """Makes the edit to a body's `inertial`, which has a `fullinertia` (mjcf.py). Of
+    its shapes the edit sees spheres."""
     if not children(body, "inertial"):
         name = body.getAttribute("name")
         raise ValueError(f"body {name!r} has no mass and inertia to change")
@@ -90,6 +91,12 @@ def _edit_mjcf(
     keys = (f"i{key}" for key in MOMENTS | PRODUCTS)
     moments = dict(zip(keys, map(repr, full), strict=True))
     own.appendChild(_element(document, "inertia", **moments))
+    for geom in children(body, "geom"):
+        if geom.getAttribute("type") == "sphere" and not geom.hasAttribute("contype"):
+            shape = link.appendChild(_element(document, "collision"))
+            shape = shape.appendChild(_element(document, "geometry"))
+            radius = geom.getAttribute("size").split()[0]
+            shape.appendChild(_element(document, "sphere", radius=radius))
     edit(effect, link)
     new = read_inertial(link)
     written = [new.central[i, j] for i, j in (MOMENTS | PRODUCTS).values()]

@@ -1,0 +1,263 @@
+"""Objects in a model's own file (MJCF here): their poses, and lists of coordinates."""
+
+import json
+
+import numpy as np
+import pytest
+import yaml
+from scipy.spatial.transform import Rotation
+
+from makebreak.gap.data.coordinates import by_lists
+from makebreak.gap.data.reading import read_recordings
+from makebreak.gap.data.robot import Log, propose_scene, read_robot
+from makebreak.gap.data.table import RecordingTable
+from makebreak.gap.residuals.contact_problem import ContactProblem
+from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.effects.kind import Effect
+from makebreak.models.scene import read_scene
+
+mujoco = pytest.importorskip("mujoco", reason="MuJoCo has no wheels for Python 3.10")
+
+N = 300
+T = 0.01 * np.arange(N)
+FLOOR = '<geom name="floor" type="plane" size="3 3 .1" friction="1 .005 .0001"/>'
+
+
+def mjcf(bodies: str, more: str = "", option: str = "") -> str:
+    return (
+        '<mujoco model="w"><option timestep=".001" integrator="implicitfast" '
+        f"{option}/><worldbody>{FLOOR}{bodies}</worldbody>{more}</mujoco>"
+    )
+
+
+def box(name: str, place: str, mass: float = 0.6) -> str:
+    return (
+        f'<body name="{name}" pos="{place}"><freejoint/><geom type="box" '
+        f'size=".06 .05 .04" mass="{mass}" friction=".4 .005 .0001"/></body>'
+    )
+
+
+def slide(name: str, axis: str, inner: str = "") -> str:
+    return (
+        f'<body name="{name}_link"><joint name="{name}" type="slide" axis="{axis}" '
+        'damping="8"/><geom type="sphere" size=".02" mass=".5" contype="0" '
+        f'conaffinity="0"/>{inner}</body>'
+    )
+
+
+FINGER = (
+    '<body name="pusher" pos="0 0 .05"><joint name="px" type="slide" axis="1 0 0" '
+    'damping="8"/><joint name="py" type="slide" axis="0 1 0" damping="8"/>'
+    '<geom type="sphere" size=".02" mass=".5" friction=".4 .005 .0001"/></body>'
+)
+SERVOS = (
+    '<actuator><position joint="py" kp="600" kv="30"/>'
+    '<position joint="px" kp="600" kv="30"/></actuator>'
+)
+
+
+def proposed(folder, text: str, columns):
+    """A scene's text, {column: channel, with its scale}, and what is said."""
+    (folder / "w.xml").write_text(text)
+    table = {k: np.asarray(y, float) for k, y in columns.items()}
+    log = Log(folder / "log.csv", RecordingTable(table, np.arange(N) + 1, N))
+    found = propose_scene(read_robot(folder / "w.xml"), [log])
+    own = yaml.safe_load(found.sidecars[log.path])["columns"]
+    return found.scene, own, found
+
+
+def swing(k: int) -> np.ndarray:
+    return 0.1 * np.sin((1.0 + 0.3 * k) * T)
+
+
+def pose(k: int) -> np.ndarray:
+    """(N, 7): x y z, w x y z."""
+    place = np.stack([swing(k), 0.1 + swing(k + 1), 0.04 + 0 * T], axis=1)
+    turn = Rotation.from_euler("xyz", np.stack([0 * T, 0 * T, 3 * swing(k)], axis=1))
+    return np.hstack([place, turn.as_quat(scalar_first=True)])
+
+
+def listed(stem: str, y: np.ndarray) -> dict[str, np.ndarray]:
+    return {f"{stem}[{k}]": y[:, k] for k in range(y.shape[1])}
+
+
+PARTS = ["x", "y", "z", "qw", "qx", "qy", "qz"]
+
+
+@pytest.mark.parametrize("tail", ["qpos", "state"])
+def test_lists_of_all_coordinates_are_the_models_own(tmp_path, tail):
+    """A box before the joints, as the file has them; a state has velocities, too."""
+    q = np.hstack([pose(0), swing(3)[:, None], swing(4)[:, None]])
+    v = np.gradient(q[:, 1:], 0.01, axis=0)
+    columns = {"time": T} | listed(tail, q if tail == "qpos" else np.hstack([q, v]))
+    if tail == "qpos":
+        columns |= listed("qvel", v)
+    scene, own, found = proposed(
+        tmp_path, mjcf(box("crate", "0 .1 .04") + FINGER, SERVOS), columns
+    )
+    for k, part in enumerate(PARTS):
+        assert own[f"{tail}[{k}]"] == f"w.crate.{part}"
+    assert [own[f"{tail}[{k}]"] for k in (7, 8)] == ["w.px.position", "w.py.position"]
+    last = "qvel[6]" if tail == "qpos" else f"{tail}[15]"
+    assert own[last] == "w.px.velocity"
+    first = "qvel[0]" if tail == "qpos" else f"{tail}[9]"
+    assert own[first] is None  # Of what is free: in whose axes is not said.
+    assert "add_weld" not in scene  # Nothing holds it.
+    assert "crate moves freely: its pose is in the log" in found.notes
+
+
+def test_seven_numbers_of_a_body_are_known_in_any_order():
+    p = pose(1)
+    order, roll = [("box", 7), ("j", 1)], np.roll
+    for columns, expected in (
+        (p, ["x", "y", "z", "qw", "qx", "qy", "qz"]),  # MuJoCo
+        (np.hstack([p[:, :3], roll(p[:, 3:], -1, 1)]),
+         ["x", "y", "z", "qx", "qy", "qz", "qw"]),  # pinocchio
+        (roll(p, 4, 1), ["qw", "qx", "qy", "qz", "x", "y", "z"]),  # Drake
+    ):  # fmt: skip
+        q = np.hstack([columns, swing(0)[:, None]])
+        found = by_lists(listed("q", q), "m", order, ())
+        told = [found[f"q[{k}]"].channel for k in range(8)]
+        assert told == [*(f"m.box.{part}" for part in expected), "m.j.position"]
+    # Seven numbers that are no pose, and a list that is shorter.
+    assert not by_lists(listed("q", np.tile(T[:, None], 8)), "m", order, ())
+    assert not by_lists(listed("q", p), "m", order, ())
+
+
+def test_ctrl_counts_actuators_and_not_joints(tmp_path):
+    """The first joint has none, and the file has them in another order."""
+    passive = slide("rail", "0 1 0")
+    columns = {"time": T, "qpos[0]": swing(0), "qpos[1]": swing(1), "qpos[2]": swing(2)}
+    columns |= {"ctrl[0]": swing(2), "ctrl[1]": swing(1)}
+    _, own, _ = proposed(tmp_path, mjcf(passive + FINGER, SERVOS), columns)
+    assert own["ctrl[0]"] == "w.py.position_command"
+    assert own["ctrl[1]"] == "w.px.position_command"
+
+
+@pytest.mark.parametrize(
+    ("names", "scale"),
+    [
+        ([f"crate_{p}" for p in PARTS], 1.0),
+        ([*(f"crate.pos.{a} [mm]" for a in "xyz"),
+          *(f"crate.rot.{a}" for a in "wxyz")], 1e-3),
+        ([f"object_pose[{k}]" for k in range(3)]
+         + [f"object_quat[{k}]" for k in range(4)], 1.0),
+        (["x", "y", "z", "qw", "qx", "qy", "qz"], 1.0),
+    ],
+)  # fmt: skip
+def test_an_objects_pose_is_known_by_names(tmp_path, names, scale):
+    p = pose(2)
+    p[:, :3] /= scale
+    columns = {"time": T} | dict(zip(names, p.T, strict=True))
+    scene, own, _ = proposed(tmp_path, mjcf(box("crate", "0 0 .04")), columns)
+    for name, part in zip(names, PARTS, strict=True):
+        channel = f"w.crate.{part}"
+        mapped = own.get(name, name)
+        if part in "xyz" and scale != 1.0:
+            assert mapped == {"channel": channel, "scale": scale}
+        else:
+            assert mapped == channel
+    assert "actuation: {type: none}" in scene
+
+
+def test_two_objects_have_their_own_columns_and_angles_are_a_pose(tmp_path):
+    """The second one's turn is given in degrees; the first one's pose is not there."""
+    bodies = box("box", "0 0 .04") + box("box_red", ".5 0 .04")
+    place = dict(zip((f"box_red_{a}" for a in "xyz"), pose(0).T, strict=False))
+    turn = {f"box_red_{a} [deg]": np.rad2deg(swing(k))
+            for k, a in enumerate(("roll", "pitch", "yaw"))}  # fmt: skip
+    scene, own, found = proposed(tmp_path, mjcf(bodies), {"time": T} | place | turn)
+    assert own["box_red_x"] == "w.box_red.x"
+    degree = {"channel": "w.box_red.yaw", "scale": pytest.approx(np.pi / 180)}
+    assert own["box_red_yaw [deg]"] == degree
+    # What has no pose stands where the file has it.
+    (weld,) = [line for line in scene.splitlines() if "add_weld" in line]
+    assert "child: w::box," in weld and "0.04]" in weld
+    assert any(note.startswith("box is welded") for note in found.notes)
+    table = np.column_stack([T, *place.values(), *turn.values()])
+    np.savetxt(tmp_path / "log.csv", table, delimiter=",", comments="",
+               header=",".join(["time", *place, *turn]))  # fmt: skip
+    (tmp_path / "log.yaml").write_text(json.dumps({"columns": own}))
+    (read,) = read_recordings([tmp_path / "log.csv"])
+    q = read.stack("w.box_red", ("qw", "qx", "qy", "qz"))
+    true = Rotation.from_euler("xyz", np.stack([swing(k) for k in range(3)], axis=1))
+    off = true.inv() * Rotation.from_quat(q, scalar_first=True)
+    assert off.magnitude().max() < 1e-6 and "w.box_red.yaw" not in read
+
+
+def test_what_does_not_hang_together_may_touch(tmp_path):
+    """A finger in a crate's side, and its foot in the ground: no filter takes that."""
+    q = np.tile([0.05, 0.0], (N, 1)) + 0.02 * np.stack([swing(0), swing(1)], axis=1)
+    columns = {"time": T} | listed("qpos", np.hstack([q, np.tile(
+        [0.12, 0.0, 0.038, 1.0, 0.0, 0.0, 0.0], (N, 1))]))  # fmt: skip
+    text = mjcf(FINGER + box("crate", ".12 0 .04"), SERVOS)
+    scene, _, found = proposed(tmp_path, text, columns)
+    assert "collision_filter" not in scene
+    assert not any(each.kind == "parts_overlap" for each in found.said)
+    (tmp_path / "scene.yaml").write_text(scene)
+    plant = SceneDynamics(read_scene(tmp_path / "scene.yaml")).plant
+    assert plant.num_positions() == 9
+
+
+def pushed(folder, mass: float):
+    """A finger pushes a box of 0.9 kg, which the model takes for `mass`."""
+    text = mjcf(FINGER + box("box", ".12 0 .04", 0.9), SERVOS, 'cone="elliptic"')
+    text = text.replace('friction="1 ', 'friction=".4 ')
+    model = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(model)
+    places = [(0, 0), (.15, 0), (.02, 0), (.05, .12), (.2, .12), (.2, .02),
+              (.2, .2), (.05, .2), (.1, 0), (.3, .02), (.1, .02), (.1, .1),
+              (.35, .1)]  # fmt: skip
+    rows = []
+    for step in range(16000):
+        k, at = divmod(0.01 * (step // 10), 1.3)
+        a, b = (np.array(places[min(int(k) + n, len(places) - 1)]) for n in (0, 1))
+        u = min(at / 0.9, 1.0)
+        data.ctrl[::-1] = a + (b - a) * (10 * u**3 - 15 * u**4 + 6 * u**5)
+        if step % 5 == 0:
+            rows.append([0.001 * step, *data.qpos, *data.qvel[:2], *data.ctrl])
+        mujoco.mj_step(model, data)
+    table = np.array(rows)
+    table[:, 1:10] += 1e-4 * np.random.default_rng(1).normal(size=(len(table), 9))
+    names = ["time", *(f"qpos[{k}]" for k in range(9)), "v_px", "v_py",
+             "ctrl[0]", "ctrl[1]"]  # fmt: skip
+    columns = dict(zip(names, table.T, strict=True))
+    np.savez(folder / "log.npz", **columns)
+    (folder / "w.xml").write_text(text.replace('mass="0.9"', f'mass="{mass}"'))
+    read = RecordingTable(columns, np.arange(len(table)) + 1, len(table))
+    log = Log(folder / "log.npz", read)
+    found = propose_scene(read_robot(folder / "w.xml"), [log])
+    (folder / "scene.yaml").write_text(found.scene)
+    (folder / "log.yaml").write_text(found.sidecars[folder / "log.npz"])
+    return read_scene(folder / "scene.yaml"), read_recordings([folder / "log.npz"])
+
+
+def test_contacts_that_creep_are_no_other_mass(tmp_path):
+    """MuJoCo's friction is soft: what is held slips by centimetres a second. Taken for
+    sliding, it tells of other masses; taken for what may hold, of the true one."""
+    scene, recordings = pushed(tmp_path, 0.6)
+    left = {}
+    for slides in (0.01, 0.1):
+        problem = ContactProblem(scene, recordings, slides=slides)
+        true = [Effect("object_mass", ["w.box"], {"mass": 0.9})]
+        left[slides] = [
+            float(np.sqrt(np.mean(problem.residual(each) ** 2))) for each in ((), true)
+        ]
+
+    assert left[0.1][1] < 1.2 < left[0.01][1]
+    assert left[0.1][1] < 0.7 * left[0.1][0]
+
+
+def test_friction_of_a_pair_is_mujocos(tmp_path):
+    """The larger of the two shapes', where Drake would have 2 a b / (a + b)."""
+    text = mjcf(FINGER + box("crate", ".12 0 .04"), SERVOS).replace(
+        'friction=".4 .005 .0001"/></body></w', 'friction=".3 .005 .0001"/></body></w'
+    )
+    q = np.hstack([swing(0)[:, None], swing(1)[:, None], pose(2)])
+    columns = {"time": T} | listed("qpos", q)
+    scene, _, _ = proposed(tmp_path, text, columns)
+    (tmp_path / "scene.yaml").write_text(scene)
+    dynamics = SceneDynamics(read_scene(tmp_path / "scene.yaml"))
+    for pair, friction in (("WorldModelInstance.world", 1.0), ("w.pusher", 0.4)):
+        now = dynamics.now("contact_friction", [f"w.crate~{pair}"])
+        assert now["friction"] == pytest.approx(friction)
