@@ -375,11 +375,10 @@ def _compared(
         )
         seconds["impacts"] = clock.lap()
     again: ProblemOf = partial(problem_for, meets=meets)
-    if result.verdict == "gap_unnamed" and isinstance(problem, ContactProblem):
-        what = "comparing with contacts that creep"
-        problem, selection, result = budget.if_time(
-            what, with_creep, (problem, selection, result)
-        )
+    touching = isinstance(problem, ContactProblem)
+    if result.verdict == "gap_unnamed" and touching:
+        what, now = "comparing with contacts that creep", (problem, selection, result)
+        problem, selection, result = budget.if_time(what, with_creep, now)
         seconds["creep"] = clock.lap()
     if result.verdict == "gap_unnamed" and is_driven(scene, decided):
         was, what = problem, "comparing in another way"

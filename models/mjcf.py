@@ -214,7 +214,7 @@ class _Writer:
         for g in np.flatnonzero(m.geom_contype | m.geom_conaffinity):
             own = int(m.geom_priority[g]), float(m.geom_friction[g][0])
             of[int(m.geom_bodyid[g])] = max(own, of.get(int(m.geom_bodyid[g]), own))
-        found, beyond = [], set[int]()
+        found, beyond = list[tuple[int, int, float, bool]](), set[int]()
         for (a, one), (b, two) in combinations(sorted(of.items()), 2):
             if m.body_weldid[a] == m.body_weldid[b]:
                 continue
@@ -225,8 +225,12 @@ class _Writer:
             # have with others has to be said, too.
             beyond |= {a, b} if mu >= 2.0 * min(one[1], two[1]) else set()
             found.append((a, b, mu, not np.isclose(mu, drake)))
+
+        def name(body: int) -> str:
+            return self._name("body", body) if body else ""
+
         return tuple(
-            (*("" if k == 0 else self._name("body", k) for k in (a, b)), mu)
+            (name(a), name(b), mu)
             for a, b, mu, differs in sorted(found, key=lambda each: -each[2])
             if differs or {a, b} & beyond
         )

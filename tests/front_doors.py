@@ -1164,7 +1164,7 @@ def after_a_base(log: Log):
             own[f"{name}_{k + n}"] = log.columns[column]
     log.columns = still | own
     log.truth = {k.replace("_measured", "_command"): y for k, y in log.truth.items()}
-    return ("of an unknown joint",)
+    return ("a list of all coordinates",)
 
 
 def at_the_motor(log: Log):

@@ -122,6 +122,16 @@ def test_a_block_on_a_rail_is_an_object_that_is_pushed(tmp_path, rng):
     # Apart from each other they push nothing.
     apart = read_recordings([write_log(tmp_path, rng, touching=False)])
     assert not push_each_other(dynamics, apart)
+    # And of its own equation each mass is weighed by its own noise: that of a lighter
+    # body is smaller as a whole.
+    rows = problem.channel_of_rows() == index
+    pairs = problem.weighed_alike((), [heavy])
+    assert len(pairs) == 2 and rows.any()
+    for pair in pairs:
+        for left, effects in zip(pair, ((), [heavy]), strict=True):
+            own = problem.residual(effects)
+            np.testing.assert_array_equal(left[rows], own[rows])
+    assert any((two != problem.residual([heavy])).any() for _, two in pairs)
 
 
 def test_a_block_of_the_modelled_mass_is_no_gap(tmp_path, rng):

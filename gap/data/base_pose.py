@@ -65,8 +65,8 @@ class _Sought:
 
     names: tuple[frozenset[str], ...]
     others: tuple[frozenset[str], ...]
-    words: Collection[str]
-    never: Collection[str]
+    words: set[str]
+    never: set[str]
 
     def rank(self, words: set[str]) -> int | None:
         """0 where its own name is in it, 1 where it is one for such a body, else 2;
@@ -92,11 +92,11 @@ def base_pose(
     """
     if not bases:
         return None
-    names, other = (tuple(frozenset(words_of(n)) for n in own)
-                    for own in (bases, others))  # fmt: skip
-    sought = _Sought(names, other, _BASE, _NOT)
+    own, other = (tuple(frozenset(words_of(n)) for n in each)
+                  for each in (bases, others))  # fmt: skip
+    sought = _Sought(own, other, _BASE, _NOT)
     if not carries:
-        sought = _Sought(names, other, _OBJECT, _NOT - _OBJECT)
+        sought = _Sought(own, other, _OBJECT, _NOT - _OBJECT - {"camera", "cam"})
     first = next((c for c in logs if _orientations(c, sought)), None)
     if first is None:
         return None

@@ -60,11 +60,20 @@ class ContactRows(FeltWalls):
         each of two models that are both below the noise seems better the heavier it is.
         Not so where a drive's gain is another: all forces are in another unit then, the
         noise with them, and by the weights of one model the one with the smaller forces
-        would leave less. Of these each is weighed by its own.
+        would leave less. Of these each is weighed by its own. So is the equation of a
+        joint that nothing drives, of which the size of all its terms is free: half of
+        an inertia is no better than twice the damping for being less.
         """
+        own = self._left_by(one), self._left_by(other)
         if _gains(one) != _gains(other):
-            return [(self._left_by(one), self._left_by(other))]
-        return [(self._left_by(one, w), self._left_by(other, w)) for w in (one, other)]
+            return [own]
+        passive = [i for j, (_, i) in self.joints.items() if self.by[j] == "passive"]
+        free = np.isin(self.channel_of_rows(), passive)
+        both = [[self._left_by(each, w) for each in (one, other)] for w in (one, other)]
+        return [
+            tuple(np.where(free, x, y) for x, y in zip(own, each, strict=True))
+            for each in both
+        ]
 
     def base(self) -> np.ndarray:
         if self._base is None:
