@@ -495,7 +495,7 @@ def other_problem(
 def _contact_problem(
     scene: Scene, recordings: Sequence[Recording], slides: float = SLIDES
 ) -> tuple[ContactProblem, list[Finding]]:
-    contact = contact_problem(scene, recordings, slides)
+    contact = contact_problem(scene, recordings, slides=slides)
     return contact, sap_lift(contact) + point_on_face(contact, contact.lying())
 
 

@@ -78,6 +78,7 @@ def outcomes(monkeypatch, error):
     )
     problem = SimpleNamespace(
         scene=None,
+        slides=0.0,
         recordings=[],
         tracks=[],
         _windows=None,
