@@ -186,7 +186,12 @@ class _Writer:
         ET.SubElement(root, "compiler", angle="radian", autolimits="true")
         self.assets = ET.SubElement(root, "asset")
         places = {0: ET.SubElement(root, "worldbody")}
-        self._shapes(0, places[0])
+        # Each fixed shape on a body of its own: one that effects can name, and move.
+        for g in range(m.body_geomnum[0]):
+            at = places[0]
+            if m.geom_contype[g] or m.geom_conaffinity[g]:
+                at = ET.SubElement(places[0], "body", name=self._fixed(g))
+            self._shape(g, at)
         for body in range(1, m.nbody):
             places[body] = self._body(body, places[m.body_parentid[body]])
         self._contact(root)
@@ -210,12 +215,14 @@ class _Writer:
     def _frictions(self) -> tuple[tuple[str, str, float], ...]:
         """Of a body's shapes the one with most friction counts."""
         m = self.m
-        of: dict[int, tuple[int, float]] = {}  # {body: (priority, friction)}
+        of: dict[tuple[int, str], tuple[int, float]] = {}  # Priority, friction.
         for g in np.flatnonzero(m.geom_contype | m.geom_conaffinity):
+            body = int(m.geom_bodyid[g])
+            name = self._name("body", body) if body else self._fixed(int(g))
             own = int(m.geom_priority[g]), float(m.geom_friction[g][0])
-            of[int(m.geom_bodyid[g])] = max(own, of.get(int(m.geom_bodyid[g]), own))
-        found, beyond = list[tuple[int, int, float, bool]](), set[int]()
-        for (a, one), (b, two) in combinations(sorted(of.items()), 2):
+            of[body, name] = max(own, of.get((body, name), own))
+        found, beyond = list[tuple[str, str, float, bool]](), set[str]()
+        for ((a, first), one), ((b, second), two) in combinations(of.items(), 2):
             if m.body_weldid[a] == m.body_weldid[b]:
                 continue
             mu = max(one, two)[1] if one[0] != two[0] else max(one[1], two[1])
@@ -223,14 +230,11 @@ class _Writer:
             drake = 2.0 * one[1] * two[1] / total if total else 0.0
             # An effect then gives both surfaces another friction, so that what these
             # have with others has to be said, too.
-            beyond |= {a, b} if mu >= 2.0 * min(one[1], two[1]) else set()
-            found.append((a, b, mu, not np.isclose(mu, drake)))
-
-        def name(body: int) -> str:
-            return self._name("body", body) if body else ""
-
+            if mu >= 2.0 * min(one[1], two[1]):
+                beyond |= {first, second}
+            found.append((first, second, mu, not np.isclose(mu, drake)))
         return tuple(
-            (name(a), name(b), mu)
+            (a, b, mu)
             for a, b, mu, differs in sorted(found, key=lambda each: -each[2])
             if differs or {a, b} & beyond
         )
@@ -366,37 +370,46 @@ class _Writer:
 
     # ----- Shapes
 
+    def _fixed(self, geom: int) -> str:
+        """The name of the body that has one of the world's own shapes."""
+        name = self.m.geom(geom).name or f"ground_{geom}"
+        taken = {self._name("body", k) for k in range(1, self.m.nbody)}
+        return f"{name}_fixed" if name in taken else name
+
     def _shapes(self, body: int, at: ET.Element) -> None:
+        first = self.m.body_geomadr[body]
+        for g in range(first, first + self.m.body_geomnum[body]):
+            self._shape(g, at)
+
+    def _shape(self, g: int, at: ET.Element) -> None:
+        """Nothing for one that is for display, or of a type that is left out."""
         m = self.m
-        first = m.body_geomadr[body]
-        for g in range(first, first + m.body_geomnum[body]):
-            kind = self.mj.mjtGeom(m.geom_type[g]).name[len("mjGEOM_") :].lower()
-            touches = bool(m.geom_contype[g] or m.geom_conaffinity[g])
-            if kind == "mesh":
-                if not touches:
-                    continue  # For display alone.
-                more = {"mesh": self._mesh(int(m.geom_dataid[g]))}
-            elif kind in ("plane", "sphere", "capsule", "ellipsoid", "cylinder", "box"):
-                size = m.geom_size[g].copy()
-                if kind == "plane":
-                    size[2] = size[2] or 1.0
-                more = {"size": _numbers(size)}
-            else:
-                if touches:
-                    self.notes.append(
-                        f"geom {self._name('geom', g)}: a shape of type {kind} is left "
-                        "out"
-                    )
-                continue
-            attributes = {
-                "name": self._name("geom", g), "type": kind, **more, "mass": "0",
-                "pos": _numbers(m.geom_pos[g]), "quat": _numbers(m.geom_quat[g]),
-                "friction": _numbers(m.geom_friction[g][:1]),
-                "rgba": _numbers(m.geom_rgba[g]),
-            }  # fmt: skip
+        kind = self.mj.mjtGeom(m.geom_type[g]).name[len("mjGEOM_") :].lower()
+        touches = bool(m.geom_contype[g] or m.geom_conaffinity[g])
+        if kind == "mesh":
             if not touches:
-                attributes |= {"contype": "0", "conaffinity": "0", "group": "1"}
-            ET.SubElement(at, "geom", attributes)
+                return  # For display alone.
+            more = {"mesh": self._mesh(int(m.geom_dataid[g]))}
+        elif kind in ("plane", "sphere", "capsule", "ellipsoid", "cylinder", "box"):
+            size = m.geom_size[g].copy()
+            if kind == "plane":
+                size[2] = size[2] or 1.0
+            more = {"size": _numbers(size)}
+        else:
+            if touches:
+                self.notes.append(
+                    f"geom {self._name('geom', g)}: a shape of type {kind} is left out"
+                )
+            return
+        attributes = {
+            "name": self._name("geom", g), "type": kind, **more, "mass": "0",
+            "pos": _numbers(m.geom_pos[g]), "quat": _numbers(m.geom_quat[g]),
+            "friction": _numbers(m.geom_friction[g][:1]),
+            "rgba": _numbers(m.geom_rgba[g]),
+        }  # fmt: skip
+        if not touches:
+            attributes |= {"contype": "0", "conaffinity": "0", "group": "1"}
+        ET.SubElement(at, "geom", attributes)
 
     def _mesh(self, i: int) -> str:
         if i not in self.meshes:

@@ -158,6 +158,11 @@ def test_an_objects_pose_is_known_by_names(tmp_path, names, scale):
         else:
             assert mapped == channel
     assert "actuation: {type: none}" in scene
+    # The ground has a name, so that an effect can be at it.
+    (tmp_path / "scene.yaml").write_text(scene)
+    dynamics = SceneDynamics(read_scene(tmp_path / "scene.yaml"))
+    assert dynamics.places("contact_friction") == ["w.crate~w.floor"]
+    assert dynamics.places("plane_height") == ["w.floor"]
 
 
 def test_two_objects_have_their_own_columns_and_angles_are_a_pose(tmp_path):
@@ -258,6 +263,6 @@ def test_friction_of_a_pair_is_mujocos(tmp_path):
     scene, _, _ = proposed(tmp_path, text, columns)
     (tmp_path / "scene.yaml").write_text(scene)
     dynamics = SceneDynamics(read_scene(tmp_path / "scene.yaml"))
-    for pair, friction in (("WorldModelInstance.world", 1.0), ("w.pusher", 0.4)):
+    for pair, friction in (("w.floor", 1.0), ("w.pusher", 0.4)):
         now = dynamics.now("contact_friction", [f"w.crate~{pair}"])
         assert now["friction"] == pytest.approx(friction)

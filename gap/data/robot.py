@@ -330,11 +330,11 @@ FROM_EFFORTS = "from the measured efforts, which are what such servos give"
 
 @dataclass(frozen=True)
 class Proposal:
-    """A scene and a sidecar for each log, as texts. notes: what was guessed. gains_of:
-    how drives' gains were guessed, in words; "" where none had to be, or where motion
-    tells them. is_driven: whether a column says what drives the joints. without: of
-    joints that have no column of a position; unused: columns of quantities of unknown
-    joints. fixed: joints that are taken to stand still. first: the first log's name.
+    """A scene and a sidecar for each log, as texts. notes: what was guessed. joints: of
+    the scene. gains_of: how drives' gains were guessed, in words; "" where none had to
+    be, or where motion tells them. is_driven: whether a column says what drives the
+    joints. without: of joints that have no column of a position; unused: columns of
+    quantities of unknown joints. fixed: joints that are taken to stand still. first: the first log's name.
     copies: {name beside the scene: text} of models that are not used as they are.
     unread: what of the robot's file is not used. said: what columns' contents say
     beside their names."""
@@ -342,6 +342,7 @@ class Proposal:
     scene: str
     sidecars: dict[Path, str]
     notes: tuple[str, ...]
+    joints: tuple[str, ...] = ()
     gains_of: str = ""
     is_driven: bool = True
     without: tuple[str, ...] = ()
@@ -383,7 +384,7 @@ class Proposal:
                 "it to another joint: what it does is not compared."
             )
             found.append(Finding(FIXED, name, "time", 0, "", "warning", says))
-        if not self.is_driven:
+        if not self.is_driven and self.joints:
             says = (
                 "No column is an effort or a command, so no torque acts on the joints "
                 "of this proposed scene. If the log has one, name its column in the "
@@ -712,6 +713,7 @@ def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
         "\n".join(lines) + "\n",
         sidecars,
         tuple(notes),
+        tuple(j.name for j in robot.joints),
         gains,
         is_driven,
         without,
@@ -798,10 +800,8 @@ def _effects_of_file(robot: Robot, fixed, lines: Sequence[str]) -> list[str]:
         )
     for *two, friction in robot.file.frictions:
         if set(two) & set(robot.free):
-            ends = (
-                f"{robot.model}.{b}" if b else "WorldModelInstance.world"
-                for b in sorted(two, key=lambda b: b not in robot.free)
-            )
+            two.sort(key=lambda body: body not in robot.free)
+            ends = (f"{robot.model}.{body}" for body in two)
             out.append(
                 f'- {{kind: contact_friction, at: "{"~".join(ends)}", parameters: '
                 f"{{friction: {friction!r}}}}}  # From the file: MuJoCo's larger one."
