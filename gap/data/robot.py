@@ -330,14 +330,15 @@ FROM_EFFORTS = "from the measured efforts, which are what such servos give"
 
 @dataclass(frozen=True)
 class Proposal:
-    """A scene and a sidecar for each log, as texts. notes: what was guessed. joints: of
-    the scene. gains_of: how drives' gains were guessed, in words; "" where none had to
-    be, or where motion tells them. is_driven: whether a column says what drives the
-    joints. without: of joints that have no column of a position; unused: columns of
-    quantities of unknown joints. fixed: joints that are taken to stand still. first: the first log's name.
-    copies: {name beside the scene: text} of models that are not used as they are.
-    unread: what of the robot's file is not used. said: what columns' contents say
-    beside their names."""
+    """A scene and a sidecar for each log, as texts. notes: what was guessed.
+    joints: of the scene. gains_of: how drives' gains were guessed, in words; ""
+    where none had to be, or where motion tells them. is_driven: whether a column
+    says what drives the joints. without: of joints that have no column of a
+    position; unused: columns of quantities of unknown joints. fixed: joints that
+    are taken to stand still. first: the first log's name. copies: {name beside the
+    scene: text} of models that are not used as they are. unread: what of the
+    robot's file is not used. said: what columns' contents say beside their
+    names."""
 
     scene: str
     sidecars: dict[Path, str]
