@@ -487,7 +487,8 @@ def other_problem(
     searched, else its windows. Raises: DoesNotFit."""
     if isinstance(problem, DrivenProblem):
         return equations_of(scene, recordings, dynamics, jobs)
-    driven = DrivenProblem(scene, recordings)
+    known = {**scene.tolerance, **problem.scene.tolerance}  # How friction stops joints.
+    driven = DrivenProblem(replace(scene, tolerance=known), recordings)
     driven.learn_misfit()
     return driven, []
 

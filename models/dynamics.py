@@ -49,6 +49,7 @@ from makebreak.models.scene import (
 )
 from makebreak.models.scene_schema import COMMANDS_OF
 from makebreak.systems.numerics import joint_tree as tree_dynamics
+from makebreak.systems.numerics.joint_laws import coulomb_of
 from makebreak.systems.numerics.joint_tree import JointTree
 
 SLOPE_STEPS = (1e-4, 0.05)  # Of positions and velocities, for slopes of accelerations.
@@ -82,6 +83,7 @@ class SceneDynamics:
             self._tree_pulls = body_laws(self.loaded.effects, self.plant)
         except NoJointTree:
             self._tree = None
+        self._coulombs = coulomb_of(joint_laws(self.loaded.effects, self.plant))
         self._carriers: dict = {}
         self._coordinates = _coordinates(self.plant)
 
@@ -169,9 +171,12 @@ class SceneDynamics:
 
     def residual(self, motion: Motion) -> np.ndarray:
         """effort - ID, (n, n_v)."""
-        return motion.effort - self.inverse_dynamics(
-            motion.q, motion.v, motion.vd, motion.time
-        )
+        q, v = motion.q, motion.v
+        r = motion.effort - self.inverse_dynamics(q, v, motion.vd, motion.time)
+        if motion.dry is not None:
+            for i, most, slow in self._coulombs:
+                r[:, i] += most * (np.tanh(v[:, i] / slow) - motion.dry[:, i])
+        return r
 
     def body_motion(self, body: RigidBody, q, v, vd):
         """Motion of a body's origin in the world, rotation first: Jacobian (n, 6, n_v),

@@ -38,6 +38,7 @@ TOLERANCES = {
     "shape_m": Between(0.0, 0.1, "m"),
     "drive_gains": Between(0.0, 1.0, "of kp and kd"),
     "loop_sec": Between(0.0, 0.1, "s"),
+    "friction_sec": Between(0.0, 0.1, "s"),
 }
 SIDES = ("motor", "motor side", "link", "link side")
 SIDED = ("position", "velocity", "effort_measured")  # Channels that have a side.

@@ -84,7 +84,6 @@ def outcomes(monkeypatch, error):
         _windows=None,
         lying=list,
         pressed=list,
-        creep_sec=0.0,
         _other=None,
     )
     problem._model_of = partial(mechanism.MechanismProblem._model_of, problem)

@@ -204,7 +204,7 @@ def test_friction_that_a_scene_has_may_hold_a_joint_at_rest(tmp_path):
     scene, recordings = scene_and_log(tmp_path, hidden=[friction])
     known = InverseModel(replace(scene, effects=[friction]), recordings)
     (track,) = known.tracks
-    rest = known.at_rest(track, known._rest)[:, 0]
+    rest = known.at_rest(track, 0.0, known._hold)[:, 0]
     assert rest.max() > 0.5  # It sticks where it turns round.
     assert (known._noises[0]["held"][:, 0] >= 30.0 * rest).all()
     unknown = InverseModel(scene, recordings)

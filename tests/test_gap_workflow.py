@@ -147,7 +147,7 @@ def test_a_gain_does_not_explain_away_what_models_are_off_by(tmp_path):
     nuisances = problem.nuisances()
     found = mechanism_candidates.candidates(problem, nuisances, problem.base())
     problem._found = [c for c in found if c.kind == "actuator_gain"]
-    rich = mechanism_candidates.rich_columns(problem, problem._found)
+    rich, _ = mechanism_candidates.rich_columns(problem, problem._found)
     assert rich.shape[1] == 1
     left = problem.base()  # Friction, as something that models lack.
     np.testing.assert_array_equal(problem._with_best(left, rich), left)

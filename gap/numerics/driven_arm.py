@@ -8,6 +8,8 @@ models/effects/actuation_path.py: a loop of position and velocity with a ceiling
 back-EMF, gain, bias, limit and lag after it, a gear that loses a share of the load.
 Dry friction is steep where a joint stands still; steps are implicit in what a joint's
 force owes to its own position and velocity, so that they need not be as short as that.
+Friction of a solver that solves for it softly, as MuJoCo does, is linear where it is
+not all, and minus ramp (v + lead v'): inertia and damping of a joint that it holds.
 
 Steps: Shampine, Reichelt, SIAM J. Sci. Comput. 18(1), 1997, section 3.1 (ode23s), a
 W-method: of second order with any Jacobian.
@@ -29,6 +31,7 @@ NO_COMMAND, EFFORT, LOOP = 0, 1, 2  # What drives a joint.
 _D = 1.0 / (2.0 + math.sqrt(2.0))
 _E32 = 6.0 + math.sqrt(2.0)
 _LEAST_STEP = 1e-9  # [s]
+_MOST_SETS = 20  # Sets of joints that are tried as those that friction holds.
 
 
 class DrivenArm(NamedTuple):
@@ -40,6 +43,7 @@ class DrivenArm(NamedTuple):
     path: np.ndarray  # (n, 5) gain, bias, limit, time constant, share lost to friction.
     slow: np.ndarray  # (n,) speed below which a gear's friction fades.
     most: np.ndarray  # (n,) what the joint takes at most.
+    soft: np.ndarray  # (n, 3) friction that holds softly: most, ramp, lead [s].
     laws: JointLaws  # Further forces on joints,
     pulls: BodyLaws  # and on links.
 
@@ -101,7 +105,7 @@ def _forces(arm, t, q, v, y, told, out):
 
 
 @numba.njit(cache=True)
-def _slopes(arm, t, q, v, y, told, K, D):
+def _slopes(arm, t, q, v, y, told, side, K, D):
     """How each joint's force falls with its own position K (n,) and velocity D (n,);
     where it would grow, 0: then nothing is implicit in it."""
     dq, dv = 1e-6, 1e-6
@@ -118,12 +122,15 @@ def _slopes(arm, t, q, v, y, told, K, D):
     for i in range(q.shape[0]):
         K[i] = max(K[i] / dq, 0.0)
         D[i] = max(D[i] / dv, 0.0)
+        if side[i] == 0.0:
+            D[i] += arm.soft[i, 1]
 
 
 @numba.njit(cache=True)
-def _rate(arm, t, x, told, M, L, bias, tau, out):
+def _rate(arm, t, x, told, M, L, bias, tau, side, out):
     """d/dt of x = [q, v, y] (3 n,), and the mass matrix M there; False if it is none.
-    y: what the motors that lag give."""
+    y: what the motors that lag give. side (n,): of soft friction, 0 where it is not
+    all."""
     n = bias.shape[0]
     q, v, y = x[:n], x[n : 2 * n], x[2 * n :]
     mass_and_bias(arm.tree, arm.pulls, t, q, v, M, bias)
@@ -136,11 +143,33 @@ def _rate(arm, t, x, told, M, L, bias, tau, out):
         if T > 0.0:
             u = _motor(arm, i, q[i], v[i], told[0, i], told[1, i])
             out[2 * n + i] = (u - y[i]) / T
-    if not cholesky(L, M):
-        return False
-    cholesky_solve(L, tau)
-    for i in range(n):
-        out[n + i] = tau[i]
+        if arm.soft[i, 1] == 0.0:
+            side[i] = 1.0
+        elif side[i] == 0.0:
+            M[i, i] += arm.soft[i, 1] * arm.soft[i, 2]
+    for tried in range(_MOST_SETS):
+        if not cholesky(L, M):
+            return False
+        for i in range(n):
+            held = side[i] * arm.soft[i, 0] if side[i] else arm.soft[i, 1] * v[i]
+            out[n + i] = tau[i] - held
+        cholesky_solve(L, out[n : 2 * n])
+        changes = 0
+        for i in range(n):
+            most, ramp, lead = arm.soft[i, 0], arm.soft[i, 1], arm.soft[i, 2]
+            force = ramp * (v[i] + lead * out[n + i])
+            if side[i] == 0.0 and abs(force) > most:
+                side[i], more = math.copysign(1.0, force), -ramp * lead
+            elif ramp > 0.0 and side[i] * force < most and side[i] != 0.0:
+                side[i], more = 0.0, ramp * lead
+            else:
+                continue
+            M[i, i] += more
+            changes += 1
+            if tried > 3:  # One after the other: all at once may come back.
+                break
+        if changes == 0:
+            break
     return True
 
 
@@ -173,6 +202,7 @@ def _run(arm, q, v, times, commands, tol, out):
     bias, tau, K, D, b = (
         np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n),
     )  # fmt: skip
+    side, then = np.zeros(n), np.zeros(n)
     for i in range(n):
         x[i], x[n + i] = q[i], v[i]
         x[2 * n + i] = _motor(arm, i, q[i], v[i], commands[0, 0, i], commands[0, 1, i])
@@ -180,7 +210,7 @@ def _run(arm, q, v, times, commands, tol, out):
     for row in range(commands.shape[0]):
         t, end = times[row], times[row + 1]
         told = commands[row]
-        if not _rate(arm, t, x, told, M, L, bias, tau, f0):
+        if not _rate(arm, t, x, told, M, L, bias, tau, side, f0):
             return
         while end - t > 1e-12:
             steps += 1
@@ -190,7 +220,7 @@ def _run(arm, q, v, times, commands, tol, out):
             if end - t - step < 0.1 * step:
                 step = end - t
             hd = step * _D
-            _slopes(arm, t, x[:n], x[n : 2 * n], x[2 * n :], told, K, D)
+            _slopes(arm, t, x[:n], x[n : 2 * n], x[2 * n :], told, side, K, D)
             for i in range(n):
                 for k in range(n):
                     W[i, k] = M[i, k]
@@ -200,14 +230,17 @@ def _run(arm, q, v, times, commands, tol, out):
             _implicit(arm, M, W, K, step, f0, k1, b)
             for i in range(3 * n):
                 mid[i] = x[i] + 0.5 * step * k1[i]
-            good = _rate(arm, t + 0.5 * step, mid, told, other, L, bias, tau, f1)
+            then[:] = side
+            good = _rate(arm, t + 0.5 * step, mid, told, other, L, bias, tau, then, f1)
             for i in range(3 * n):
                 r[i] = f1[i] - k1[i]
             _implicit(arm, M, W, K, step, r, k2, b)
             for i in range(3 * n):
                 k2[i] += k1[i]
                 new[i] = x[i] + step * k2[i]
-            good = good and _rate(arm, t + step, new, told, other, L, bias, tau, f2)
+            good = good and _rate(
+                arm, t + step, new, told, other, L, bias, tau, then, f2
+            )
             for i in range(3 * n):
                 r[i] = f2[i] - _E32 * (k2[i] - f1[i]) - 2.0 * (k1[i] - f0[i])
             _implicit(arm, M, W, K, step, r, k3, b)
@@ -224,6 +257,7 @@ def _run(arm, q, v, times, commands, tol, out):
                 for i in range(3 * n):
                     x[i], f0[i] = new[i], f2[i]
                 for i in range(n):
+                    side[i] = then[i]
                     for k in range(n):
                         M[i, k] = other[i, k]
             grow = 0.8 * max(error, 1e-4) ** (-1.0 / 3.0)

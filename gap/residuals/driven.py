@@ -6,7 +6,7 @@ Here windows are simulated by compiled code (gap/simulation/driven_arm.py), a hu
 times as fast as by Drake, and what effects would do is seen by differences.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -81,9 +81,6 @@ LOOP_SEC = 5e-4
 RICH = ("N m", "N m s/rad", "N m/rad", "kg m2")
 OWN = 0.02  # Of a column, what is no sum of those before it: less says the same.
 LAW = 0.1  # Of such a step: what is smaller may be the law's own error.
-# With which friction may stop joints (DrivenArmScene): of robots, and of MuJoCo's
-# solver as it comes. By how much of the error the second must be better.
-CREEP_SEC, CREEPS = (0.0, 0.001), 0.05
 HALF = 0.5  # Of what a rich model leaves: a wider kind must leave less.
 RICH_STEPS = 16  # Gauss-Newton steps of the fit of all that a joint may have.
 # Columns of links are taken again where they are off by this, over what rows are
@@ -100,20 +97,15 @@ class DrivenWindows(WindowModel):
     is simulated, too: a stiff drive soon makes it forgotten. Rows are 20 ms apart or
     more: of what a drive follows those between say nothing new.
 
-    Args: creep_sec: see DrivenArmScene.
-
     Raises: DoesNotFit where the scene takes Drake's steps, or no window fits in.
     """
 
     rows_sec = 0.02
 
-    def __init__(
-        self, scene: Scene, recordings: Sequence[Recording], creep_sec: float = 0.0
-    ):
+    def __init__(self, scene: Scene, recordings: Sequence[Recording]):
         self.looped = "position_command" in COMMANDS_OF[scene.actuation.type]
         seconds = WINDOW_SEC if self.looped else WITHOUT_LOOP_SEC
         self._arms = DrivenArmSimulation(scene)
-        self._arms.set_creep(creep_sec)
         super().__init__(
             scene, recordings, seconds, block_sec=max(seconds, 1.2), most=MOST_WINDOWS,
             simulation=self._arms,
@@ -129,11 +121,6 @@ class DrivenWindows(WindowModel):
         self.windows = [
             replace(w, std=np.sqrt(of)) for w, of in zip(given, variance, strict=True)
         ]
-
-    @property
-    def creep_sec(self) -> float:
-        """How far joints creep while friction holds them (DrivenArmScene)."""
-        return self._arms.arms.creep_sec
 
     def _best_start(self, time, states, row: int) -> int:
         """Of the next BEST_SEC, the row about which accelerations jump least: a joint
@@ -207,31 +194,14 @@ class DrivenProblem(DrivenWindows, GapProblem):
 
     # ----- What models are off by
 
-    def _set_creep(self, seconds: float) -> None:
-        """Sets creep_sec, with which nuisances do something else."""
-        self._arms.set_creep(seconds)
-        self._forget_nuisances()
-
     def _forget_nuisances(self) -> None:
         self._links, self._moved_by = (), None
         self._base = self._slopes = self._nuisances = None
-
-    def _error_with(self, creep_sec: float) -> float:
-        self._set_creep(creep_sec)
-        return rms(self.base()[self.train()])
-
-    def _best_creep(self, error_of: Callable[[float], float]) -> float:
-        """Of how far joints may creep, what leaves the least error; of two that leave
-        about the same, the smaller."""
-        left = [(error_of(seconds), seconds) for seconds in CREEP_SEC]
-        least = min(left)[0]
-        return min(s for error, s in left if (1.0 - CREEPS) * error <= least)
 
     def is_explained(self) -> bool:
         """Whether the scene as it came, its background within its tolerance, explains
         windows as well as noise lets it, and leaves no gap at any channel."""
         if self._explained is None:
-            self._set_creep(self._best_creep(self._error_with))
             unknown = self.misfit
             for _ in range(MOST_MOVES):
                 n = self.nuisances()
@@ -261,19 +231,10 @@ class DrivenProblem(DrivenWindows, GapProblem):
         if not held.any() or held.all() or self.is_explained():
             return
         n = Nuisances.none(len(held))
-        small, fits = self._independent(), {}
-
-        def error_of(creep_sec: float) -> float:
-            self._set_creep(creep_sec)
-            screen = Screen(self.base(), n.columns, n.prior, self.train())
-            fit = fit_effects(self, screen, small, evaluations=RICH_STEPS)
-            fits[creep_sec] = fit
-            return fit.fit.train
-
-        creep_sec = self._best_creep(error_of)
-        self._set_creep(creep_sec)
         screen = Screen(self.base(), n.columns, n.prior, self.train())
-        rich = self._with_wider(fits[creep_sec], screen)
+        small = self._independent()
+        rich = fit_effects(self, screen, small, evaluations=RICH_STEPS)
+        rich = self._with_wider(rich, screen)
         left = rich.r
         if rich.fit.train > screen.evaluate(self.base()).train:  # It went astray.
             left = self.base()
@@ -770,9 +731,7 @@ class DrivenProblem(DrivenWindows, GapProblem):
         scene = with_moved_gains(self.scene, nuisances.names, end.b)
         if recordings is not None or scene is not self.scene:
             try:
-                model = DrivenWindows(
-                    scene, recordings or self.recordings, self.creep_sec
-                )
+                model = DrivenWindows(scene, recordings or self.recordings)
             except DoesNotFit:  # No window fits in.
                 return None
         held = [recordings is not None or not w.train for w in model.windows]

@@ -15,7 +15,7 @@ import numpy as np
 from makebreak.gap.budget import go_on
 from makebreak.gap.data.recording import Recording
 from makebreak.gap.residuals.track import Track
-from makebreak.gap.residuals.whitened_rows import WhitenedRows
+from makebreak.gap.residuals.whitened_rows import REST_SPEED, WhitenedRows
 from makebreak.gap.simulation.channel_effects import (
     PATH,
     SENSED,
@@ -68,6 +68,16 @@ class InverseModel(WhitenedRows):
         """As of WhitenedRows; the base is then in the new units."""
         self._base = None
         return super().allow(error, more)
+
+    def hold(self, stops_sec: float, most: np.ndarray):
+        """As of WhitenedRows; what was computed with another friction is forgotten."""
+        to_new = super().hold(stops_sec, most)
+        if to_new is not None:
+            self._base = self._motions = None
+            for known in (self._needed, self._means, self._efforts):
+                known.clear()
+            self._remembering.forget()
+        return to_new
 
     def weigh_by(
         self, dynamics: SceneDynamics, gains: np.ndarray
@@ -432,7 +442,7 @@ class InverseModel(WhitenedRows):
             if joint not in at or self.laws[i] is None:
                 continue
             asked = np.concatenate([
-                np.abs(m.effort[:, i])[np.abs(m.v[:, i]) > self._rest[i]]
+                np.abs(m.effort[:, i])[np.abs(m.v[:, i]) > REST_SPEED]
                 for m in self.motions()
             ])  # fmt: skip
             if len(asked):

@@ -1,6 +1,6 @@
 """A mechanism whose joints are measured, as a problem for the search."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -42,7 +42,7 @@ from makebreak.gap.residuals.mechanism_candidates import (
 from makebreak.gap.residuals.mechanism_measure import measure
 from makebreak.gap.residuals.pushes import ROBUST, Push, find_pushes
 from makebreak.gap.residuals.where import unexplained, where_in_motion
-from makebreak.gap.residuals.whitened_rows import REST_SHARE
+from makebreak.gap.residuals.whitened_rows import REST_EFFORT, REST_SHARE, rms_of
 from makebreak.gap.result import GapMeasure, Series, Where
 from makebreak.gap.simulation.channel_effects import PATH, SENSED
 from makebreak.gap.simulation.windows import Window
@@ -61,15 +61,18 @@ from makebreak.models.effects.joints import ROTOR, rotor
 from makebreak.models.effects.kind import Effect, find_body, sliding_joints
 from makebreak.models.effects.objects import MASS
 from makebreak.models.scene import Scene
+from makebreak.systems.numerics.joint_laws import coulomb_law
 
 # Below this over the sensors' noise a rich model leaves what noise may: models are
 # right. A weight is changed where it would become less by this share.
 MISFIT, LESS = 1.3, 0.8
 LOUD = 1.5  # Rms over noise of one joint's rows that is looked into by itself.
-# Speeds [rad/s, m/s] below which a joint may be held, by what is left in test functions
-# of which so much is rest, if there are so many; and twice the log likelihood that
-# another must gain.
-RESTS, HELD_SHARE, FEW, REST_EVIDENCE = 0.005 * 2.0 ** np.arange(6), 0.7, 10, 20.0
+# With which friction may stop joints (DrivenArmScene.stops_sec): of robots, and of
+# MuJoCo's solver as it comes, (1 - d) / d of its solimp's d times its damping's time;
+# twice the log likelihood that this must gain; and how many test functions of which a
+# joint moves nearly all, or rests for so much, tell its friction.
+STOPS_SEC, REST_EVIDENCE, FEW, HELD = (1.0556e-3, 0.0), 20.0, 10, 0.7
+ABOVE = 3.0  # Times what is found at first: friction is looked for from above.
 MOST_WEIGHINGS = 10
 AT_REST = 2.0  # Times the least uncertainty: rows with more are of joints at rest.
 RICH_PRIOR = 10.0  # Times a nuisance's tolerance, in a rich model.
@@ -121,22 +124,19 @@ class MechanismProblem(InverseModel, GapProblem):
         if self.noise_error(left) < MISFIT:
             return
         self._found = candidates(self, n, left)
+        self._learn_friction()
         for _ in range(MOST_WEIGHINGS):
             n = _without_gains(self.nuisances())
-            rich = rich_columns(self, self._found)
+            rich, _ = rich_columns(self, self._found)
             prior = RICH_PRIOR * n.prior
             screen = Screen(self.base(), n.columns, prior, self.train())
             fit = screen.fit(rich)
             left = self.base() - rich @ fit.c - n.columns @ fit.b
-            unbent = self._unbent(rich, n, prior)
+            unbent = self._unbent(rich, n, prior)[0]
             pushes = self._pushes_in(unbent)
             if len(pushes) > len(self.pushes):
                 self._set_pushes(pushes, unbent)
                 continue  # What they bent is fitted again.
-            if to_new := self.hold(*self._held_in(unbent)):
-                self._base = None
-                self._reexpress(to_new)
-                continue
             error = self._misfit(left)
             # A rich model may do worse than none, where noise is all that is left; and
             # what one more effect of the catalogue explains is nothing models lack.
@@ -149,39 +149,69 @@ class MechanismProblem(InverseModel, GapProblem):
             self._set(error)
         self.correlation = self._correlation(left)
 
-    def _held_in(self, left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(n_joints,) speeds below which friction may hold a joint, and by how much
-        [N m]: the most likely ones, given what a rich model leaves (m,)."""
-        units, now = self.in_units(left), self.noise_in_units()
-        noise = self.noise_in_units(held=False)
-        speeds, most = np.array(self._rest), np.array(self._hold)
-        shares = [
-            np.concatenate([self.at_rest(t, speed) for t in self.tracks])
-            for speed in (self._rest, *RESTS)
-        ]
-        for i in range(len(self.joints)):
-            u, own, least = units[:, i], noise[:, i], np.inf
-            at_first = np.isnan(self._hold[i])
-            for speed, at_rest in zip((self._rest[i], *RESTS), shares, strict=True):
-                share = at_rest[:, i]
-                moves, rests = share < REST_SHARE, share > HELD_SHARE
-                if min(moves.sum(), rests.sum()) < FEW:
-                    continue
-                free = own**2 + beyond_noise(u[moves], own[moves]) ** 2
-                if np.isinf(least):  # As it is now.
-                    held = now[:, i] ** 2 - own**2
-                    least = _surprise(u, free + held) - REST_EVIDENCE
-                    continue
-                size = float(rms(u[rests] / share[rests]))
-                cost, none = (
-                    _surprise(u, free + (share * held) ** 2) for held in (size, 0.0)
-                )
-                if none - REST_EVIDENCE < cost:
-                    size, cost = 0.0, none  # Nothing holds it.
-                # At first the fastest, as a fit to all bends to rows of joints at rest.
-                if cost < least or (at_first and size and not np.isnan(most[i])):
-                    least, speeds[i], most[i] = min(cost, least), speed, size
-        return speeds, most
+    def _learn_friction(self) -> None:
+        """How friction stops joints, and how much holds them: beside all that a rich
+        model has, the most likely."""
+        found = []
+        for seconds in STOPS_SEC:
+            left, most = self._with_friction(0.0)
+            most = ABOVE * most  # Where too little is held, a fit bends to damping.
+            for _ in range(MOST_WEIGHINGS):
+                if not self._hold_by(seconds, most):
+                    break
+                left, most = self._with_friction(seconds)
+            n = len(self.joints)
+            off, own = (x[:, :n] for x in (self.in_units(left), self.noise_in_units()))
+            found.append((_surprise(off, own) + REST_EVIDENCE * (seconds > 0.0), most))
+        k = min(range(len(found)), key=lambda k: found[k][0])
+        most = found[k][1]
+        if not STOPS_SEC[k]:  # Hardly any that hardly rested: any may have held it.
+            rests = [self.at_rest(t, 0.0, most) > HELD for t in self.tracks]
+            few = np.concatenate(rests).sum(axis=0) < FEW
+            noise = np.median(self.noise_in_units(held=False)[:, : len(most)], axis=0)
+            most = np.where(few & (most < FEW * noise), np.nan, most)
+        self._hold_by(STOPS_SEC[k], most)
+
+    def _hold_by(self, stops_sec: float, most: np.ndarray) -> bool:
+        """As hold, of what is kept as well; whether it is another."""
+        to_new = self.hold(stops_sec, most)
+        if to_new is None:
+            return False
+        self._reexpress(to_new)
+        self._found = [
+            c if KINDS[c.kind].joint_law is not coulomb_law
+            else replace(c, columns=(self.columns_of([
+                self.dynamics.signatures(c.kind, list(c.at), m)[0].columns
+                for m in self.motions()
+            ]),))
+            for c in self._found or ()
+        ]  # fmt: skip
+        return True
+
+    def _with_friction(self, stops_sec: float) -> tuple[np.ndarray, np.ndarray]:
+        """What a rich model leaves (m,), and (n_joints,) what may hold joints [N m] if
+        it stops them so: more where they hardly moved."""
+        n = _without_gains(self.nuisances())
+        rich, whose = rich_columns(self, self._found or ())
+        left, c = self._unbent(rich, n, RICH_PRIOR * n.prior)
+        most = self._dry + np.maximum(self._coulomb(zip(whose, c, strict=True)), 0.0)
+        rest = np.concatenate([self.at_rest(t, stops_sec, most) for t in self.tracks])
+        moves, rests = rest < REST_SHARE, rest > HELD
+        if not stops_sec:  # No law says what it does there.
+            off = self.in_units(left)[:, : len(self.joints)] / np.maximum(rest, HELD)
+            each = np.sqrt(np.sum(rests * off**2, 0) / np.maximum(rests.sum(0), FEW))
+            most = np.maximum(most, each)
+        efforts = rms_of(np.concatenate([m.effort for m in self.motions()]))
+        hardly = moves.sum(axis=0) < FEW
+        return left, np.where(hardly, np.maximum(most, REST_EFFORT * efforts), most)
+
+    def _coulomb(self, found: Iterable[tuple[Candidate | Effect, float]]) -> np.ndarray:
+        """(n_joints,) friction [N m] of those of these that are Coulomb's."""
+        out = np.zeros(len(self.joints))
+        for each, size in found:
+            if KINDS[each.kind].joint_law is coulomb_law:
+                out[[self.joints.index(at) for at in each.at]] += size
+        return out
 
     def _settled(self, r: np.ndarray) -> np.ndarray:
         """What the nuisances leave of r (m,), free within their limits."""
@@ -218,17 +248,19 @@ class MechanismProblem(InverseModel, GapProblem):
                     least[k], out[rows[k]] = power, r[rows[k]]
         return out
 
-    def _unbent(self, rich: np.ndarray, n: Nuisances, prior) -> np.ndarray:
+    def _unbent(
+        self, rich: np.ndarray, n: Nuisances, prior
+    ) -> tuple[np.ndarray, np.ndarray]:
         """What a rich model leaves (m,) that was fitted without the test functions that
         it explains least: least trimmed squares, so that what acts for a short while
-        bends nothing."""
+        bends nothing; and its parameters (k,)."""
         k, joints = len(self.names()), len(self.joints)
         noise = np.median(self.noise_in_units()[:, :joints], axis=0)
         whole = self.train()
-        train, left = whole, self.base()
+        train, left, c = whole, self.base(), np.zeros(rich.shape[1])
         for _ in range(TRIMS):
             fit = Screen(self.base(), n.columns, prior, train).fit(rich)
-            left = self.base() - rich @ fit.c - n.columns @ fit.b
+            c, left = fit.c, self.base() - rich @ fit.c - n.columns @ fit.b
             units = np.abs(self.in_units(left)[:, :joints])
             z = (units / np.maximum(ROBUST * np.median(units, axis=0), noise)).max(1)
             most = np.quantile(z, 1.0 - TRIMMED)
@@ -236,7 +268,7 @@ class MechanismProblem(InverseModel, GapProblem):
             if (kept == train).all():
                 break
             train = kept
-        return left
+        return left, c
 
     def _pushes_in(self, left: np.ndarray) -> list[Push]:
         n = len(self.joints)
@@ -348,6 +380,12 @@ class MechanismProblem(InverseModel, GapProblem):
         less = {w: np.minimum(error[w], old[w]) for w in old}
         is_less = any((less[w] < LESS * old[w]).any() for w in old)
         is_another = self._weigh_by(fitted.effects)
+        if self.stops_sec:
+            named = self._coulomb(
+                (e, next(iter(e.parameters.values()))) for e in fitted.effects
+            )
+            most = np.where(named == 0.0, self._hold, self._dry + named)
+            is_another = self._hold_by(self.stops_sec, most) or is_another
         if is_less:
             self._set(less)
         return is_less or is_another
@@ -429,7 +467,7 @@ class MechanismProblem(InverseModel, GapProblem):
         kind, n, row = self._delay_kind(), self.nuisances(), self.row_sec()
         if self._found is None:
             self._found = candidates(self, n, self._settled(self.base()))
-        lacks, train = rich_columns(self, self._of_joints()), self.train()
+        lacks, train = rich_columns(self, self._of_joints())[0], self.train()
 
         def left_by(seconds: float) -> np.ndarray:
             late = Effect(kind, given, {"delay": -seconds})
@@ -490,7 +528,7 @@ class MechanismProblem(InverseModel, GapProblem):
         these joints act so many rows early, whatever joints may lack beside it: that
         hides when they act."""
         kind, n, train = self._delay_kind(), self.nuisances(), self.train()
-        more = rich_columns(self, self._of_joints())
+        more, _ = rich_columns(self, self._of_joints())
 
         def left(periods: float) -> np.ndarray:
             """As no sample says when an effort jumps; of each channel, as most joints
@@ -874,6 +912,7 @@ class MechanismProblem(InverseModel, GapProblem):
         """That of other recordings, which is asked for again and again."""
         if self._other is None or self._other.recordings != list(recordings):
             self._other = InverseModel(self.scene, recordings)
+            self._other.hold(self.stops_sec, self._hold)
         return self._other
 
     def _effort_of_nuisances(self, nuisances: Nuisances) -> dict[str, float]:
@@ -909,9 +948,13 @@ def _without_gains(n: Nuisances) -> Nuisances:
                    names=tuple(n.names[k] for k in kept))  # fmt: skip
 
 
-def _surprise(off: np.ndarray, variance: np.ndarray) -> float:
-    """Minus twice the logarithm of the likelihood of rows (m,), but for a constant."""
-    return float(np.sum(np.log(variance) + off**2 / variance))
+def _surprise(off: np.ndarray, noise: np.ndarray) -> float:
+    """Minus twice the logarithm of the likelihood of rows (m, n), but for a constant,
+    with what models are off by beside noise; of Cauchy's distribution, as some rows are
+    off by anything."""
+    more = [beyond_noise(x, std) for x, std in zip(off.T, noise.T, strict=True)]
+    variance = noise**2 + np.square(more)
+    return float(np.sum(np.log(variance) + 2.0 * np.log1p(off**2 / variance)))
 
 
 def features_of(i: int, q, v, vd, effort, sign) -> np.ndarray:

@@ -151,17 +151,21 @@ def candidates(
     return found
 
 
-def rich_columns(model: InverseModel, found: Sequence[Candidate]) -> np.ndarray:
+def rich_columns(
+    model: InverseModel, found: Sequence[Candidate]
+) -> tuple[np.ndarray, list[Candidate]]:
     """(m, k) of all kinds with one parameter at all of their places, and a load at the
-    last link: what a model that lacks nothing ordinary would have.
+    last link: what a model that lacks nothing ordinary would have; and whose they are.
 
     A gain multiplies what the model needs: as a factor on the measured effort it would
     cancel all of that, and with it what anything is off by; as a drive's own stiffness
     would, beside it: that is no column.
     """
     last = list(model.dynamics.links())[-1:]
-    columns = []
+    columns: list[np.ndarray] = []
+    whose: list[Candidate] = []
     for c in found:
+        before = len(columns)
         if KINDS[c.kind].path == "kp":
             continue
         if KINDS[c.kind].path == "gain":
@@ -174,7 +178,9 @@ def rich_columns(model: InverseModel, found: Sequence[Candidate]) -> np.ndarray:
             columns.append(c.columns[0])
         elif KINDS[c.kind].at == "body" and list(c.at) == last and len(c.columns) == 1:
             columns.append(c.columns[0])
-    return np.hstack(columns) if columns else np.zeros((len(model.train()), 0))
+        if len(columns) > before:
+            whose += columns[-1].shape[1] * [c]
+    return np.hstack(columns or [np.zeros((len(model.train()), 0))]), whose
 
 
 def nuisances(model: InverseModel, effects: Sequence[Effect] = ()) -> Nuisances:

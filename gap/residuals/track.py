@@ -62,12 +62,11 @@ class Track:
         q = self.q[k, i] + self.v[k, i] * d + 0.5 * a * d**2 + (b - a) / h * d**3 / 6
         return q, v, vd
 
-    def motion_at_middles(self) -> tuple[np.ndarray, np.ndarray]:
-        """q, v (n_mid, n_v)."""
-        n = self.q.shape[1]
-        both = [self.at(i, self.middle)[:2] for i in range(n)]
-        q, v = (np.stack(x, axis=1) for x in zip(*both, strict=True))
-        return q, v
+    def motion_at_middles(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """q, v, vd (n_mid, n_v)."""
+        each = [self.at(i, self.middle) for i in range(self.q.shape[1])]
+        q, v, vd = (np.stack(x, axis=1) for x in zip(*each, strict=True))
+        return q, v, vd
 
     def mean_held(self, command: np.ndarray, delay: float) -> np.ndarray:
         """(n_mid,) mean over each interval of a command that arrives late."""

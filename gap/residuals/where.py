@@ -40,7 +40,7 @@ def where_in_motion(model: InverseModel, left: np.ndarray) -> list[Where]:
         rows = R[first : first + n]
         first += n
         stretch = ((track.bumps.centre - track.time[0]) / 0.5).astype(int)
-        _, v = track.motion_at_middles()
+        _, v, _ = track.motion_at_middles()
         for number in np.unique(stretch):
             mine = np.flatnonzero(stretch == number)
             half = 0.5 * track.bumps.width

@@ -6,6 +6,7 @@ mass matrix into all joints' equations.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,14 +14,17 @@ from makebreak.gap.data.recording import Recording
 from makebreak.gap.numerics.signal_noise import jump_variance
 from makebreak.gap.residuals.mechanism_motion import MechanismMotion
 from makebreak.gap.residuals.track import Track
+from makebreak.gap.simulation.driven_arm import LEAD, STOPS
 from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.effects.kind import Effect
+from makebreak.models.effects.signature import Motion
 from makebreak.models.scene import Scene, joint_laws
 from makebreak.systems.numerics.joint_laws import most_friction
 
 OTHERS = ("velocity", "effort_measured")  # Channels that are compared beside.
 # A joint that stands still, slower than this [rad/s], or [m/s], may be held by any
-# friction: what its equation says then is given this share of its rms effort as
-# uncertainty, by the share of time at rest.
+# friction: what its equation says then is given that, or this share of its rms effort
+# where no friction is known, as uncertainty, by the share of time at rest.
 REST_SPEED, REST_SHARE, REST_EFFORT = 0.005, 0.04, 0.3
 # Sampled at the very instants at which a stiff drive gets new commands, a velocity is
 # off by a share of itself.
@@ -28,6 +32,9 @@ DRIVE_VELOCITY = 0.01
 MODEL_ERROR = 2e-4  # Of a joint's rms effort: what smoothing and sampling leave.
 LEAST_EFFORT = 0.1  # Of a joint, as a share of the largest joint's: rms.
 LEAST_STD = 1e-12  # Of a channel that has no noise.
+# Of the largest friction that holds a joint: less is none other. Of a friction that
+# holds softly, what its law may be off by.
+SAME_HOLD, LAW = 0.01, 0.1
 
 
 class WhitenedRows(MechanismMotion):
@@ -43,15 +50,15 @@ class WhitenedRows(MechanismMotion):
         # of a model with effects, divided by its drives' gains.
         self._weighed_by, self._divided_by = self.dynamics, np.ones(len(self.joints))
         self._more: list[np.ndarray] = []
-        # (n_joints,) Speeds below which joints may be held by any friction, and by how
-        # much [N m]; NaN: by REST_EFFORT of their rms effort.
-        self._rest = np.full(len(self.joints), REST_SPEED)
-        self._hold = np.full(len(self.joints), np.nan)
-        # (n_joints,) What the scene's own dry friction holds.
+        # (n_joints,) What the scene's own dry friction holds [N m], and all that may
+        # hold; NaN: that is not known.
         self._dry = most_friction(
             joint_laws(self.dynamics.loaded.effects, self.dynamics.plant),
             len(self.joints),
         )
+        self._hold = np.full(len(self.joints), np.nan)
+        zero = np.zeros(self.dynamics.plant.num_positions())
+        self._mobility = np.diag(np.linalg.inv(self._mass_matrix(zero)))
         self._noises = self._noise_of_rows()
         # What models are off by, beside noise [N m, rad/s].
         self.model_error = {
@@ -63,7 +70,7 @@ class WhitenedRows(MechanismMotion):
     def _noise_of_rows(self) -> list[dict[str, np.ndarray]]:
         """For each track: the covariance of each bump's residual efforts, and standard
         deviations of the other channels', as the sensors' noise gives them."""
-        efforts = [self._effort(t, (), *t.motion_at_middles()) for t in self.tracks]
+        efforts = [self._effort(t, (), *t.motion_at_middles()[:2]) for t in self.tracks]
         rms = rms_of(np.concatenate(efforts))
         rms = np.maximum(rms, LEAST_EFFORT * rms.max())
         kp, kd = np.zeros(len(self.joints)), np.zeros(len(self.joints))
@@ -75,7 +82,7 @@ class WhitenedRows(MechanismMotion):
     def _noise_of(self, track: Track, rms, kp, kd) -> dict[str, np.ndarray]:
         """The same of one track; rms (n_v,) of the efforts, kp, kd (n_v,) of drives'
         own loops."""
-        q, v = track.motion_at_middles()
+        q, v, _ = track.motion_at_middles()
         period = track.spacing([f"{j}.position" for j in self.joints])
         g2 = track.bumps.position_noise_gain(period)
         g0 = track.bumps.noise_gain(period)
@@ -88,16 +95,21 @@ class WhitenedRows(MechanismMotion):
         direct = (kp * self.noise * g0) ** 2 + (MODEL_ERROR * rms) ** 2
         direct += np.array(self.by_measured) * (self.effort_noise * g_e) ** 2
         direct = direct + self._unknown_jumps(track) ** 2
-        rest = self.at_rest(track, self._rest)
+        rest = self.at_rest(track, self.stops_sec, self._hold)
         untold = np.where(rest > REST_SHARE, rest, 0.0) * REST_EFFORT * rms
-        held = np.where(np.isnan(self._hold), untold, rest * self._hold)
-        held = np.maximum(held, rest * self._dry)
+        held = np.maximum(rest * self._dry, untold)
+        held = np.where(np.isnan(self._hold), held, rest * self._hold)
+        if self.stops_sec:
+            held = LAW * held
         centre = np.clip(
             np.searchsorted(track.middle, track.bumps.centre), 0, len(q) - 1
         )
         C = np.empty((len(centre), len(self.joints), len(self.joints)))
+        # What friction holds softly has more inertia.
+        more = LEAD * rest / self._mobility if self.stops_sec else 0.0 * rest
         for b, k in enumerate(centre):
-            M = self._mass_matrix(q[k]) / self._divided_by[:, None]
+            M = self._mass_matrix(q[k]) + np.diag(more[b])
+            M = M / self._divided_by[:, None]
             C[b] = (M * (g2 * self.noise) ** 2) @ M.T
             C[b] += np.diag(direct[b])
         # The smoothed velocity's own error, as over one bump.
@@ -113,10 +125,31 @@ class WhitenedRows(MechanismMotion):
             ),
         }
 
-    def at_rest(self, track: Track, speed: np.ndarray | float) -> np.ndarray:
-        """(n_bumps, n_v) share of each bump in which joints are slower than this."""
-        _, v = track.motion_at_middles()
-        return track.bumps.mean((np.abs(v) < speed).astype(float))
+    @property
+    def stops_sec(self) -> float:
+        """As of DrivenArmScene."""
+        return float(self.scene.tolerance.get(STOPS, 0.0))
+
+    def at_rest(self, track: Track, stops_sec: float, dry: np.ndarray) -> np.ndarray:
+        """(n_bumps, n_v) share of each bump in which dry friction (n_v,), which stops a
+        joint so [s], may hold it: the scene's own where it is NaN."""
+        _, v, vd = track.motion_at_middles()
+        by_all = self._most(dry) * self._mobility
+        slow = np.maximum(REST_SPEED, stops_sec * (by_all + LEAD * np.abs(vd)))
+        return track.bumps.mean((np.abs(v) < slow).astype(float))
+
+    def _most(self, dry: np.ndarray) -> np.ndarray:
+        return np.where(np.isnan(dry), self._dry, dry)
+
+    def motion(self, track: Track, effects: Sequence[Effect] = ()) -> Motion:
+        """As of MechanismMotion, with the share of dry friction that acts where it is
+        not all at once."""
+        motion = super().motion(track, effects)
+        if not self.stops_sec:
+            return motion
+        by_all = self.stops_sec * np.maximum(self._most(self._hold), LEAST_STD)
+        y = motion.v + LEAD * self.stops_sec * motion.vd
+        return replace(motion, dry=np.clip(y / (by_all * self._mobility), -1.0, 1.0))
 
     def _unknown_jumps(self, track: Track) -> np.ndarray:
         """(n_bumps, n_v) standard deviations of means of measured efforts that jump
@@ -176,13 +209,17 @@ class WhitenedRows(MechanismMotion):
         self._weighed_by, self._divided_by = dynamics, gains
         return self._noises_anew()
 
-    def hold(self, rest: np.ndarray, most: np.ndarray):
-        """Takes joints for held, below speeds rest (n_joints,), by any effort up to
-        most (n_joints,) [N m]. Returns: as of allow; None where it is none other."""
-        now = zip((rest, most), (self._rest, self._hold), strict=True)
-        if all(np.allclose(a, b, rtol=0.1, equal_nan=True) for a, b in now):
+    def hold(self, stops_sec: float, most: np.ndarray):
+        """Takes joints for held by any effort up to most (n_joints,) [N m], by friction
+        that stops them so [s]. Returns: as of allow; None where it is none other."""
+        small = SAME_HOLD * np.max(np.append(most[np.isfinite(most)], 0.0))
+        is_same = np.allclose(
+            most, self._hold, rtol=SAME_HOLD, atol=small, equal_nan=True
+        )
+        if stops_sec == self.stops_sec and is_same:
             return None
-        self._rest, self._hold = rest, most
+        self._hold, known = most, self.scene.tolerance
+        self.scene = replace(self.scene, tolerance={**known, STOPS: stops_sec})
         return self._noises_anew()
 
     def _noises_anew(self) -> Callable[[np.ndarray], np.ndarray]:

@@ -54,13 +54,16 @@ from makebreak.models.joint_tree import (
 from makebreak.models.scene import Scene, body_laws, joint_laws, load_scene
 from makebreak.models.scene_schema import COMMANDS_OF, as_kind
 from makebreak.systems.numerics.body_laws import NO_BODY_LAWS
-from makebreak.systems.numerics.joint_laws import FADES_AT, JointLaws
+from makebreak.systems.numerics.joint_laws import FADES_AT, LAWS, coulomb_law
 from makebreak.systems.numerics.joint_tree import JointTree, mass_and_bias
 
 # Of the speed below which Drake's friction fades, which its steps need; these are
 # implicit in what a joint's force owes to its speed. At more, a joint that should stay
 # creeps by several times an encoder's noise within a second.
 HOLDS = 0.1
+# Key of a scene's `tolerance`; and how many of these times friction turns before the
+# joint does, of such a solver (docs/gap_joints.md).
+STOPS, LEAD = "friction_sec", 9.0
 _MOST_KEPT = 64  # Plants whose numbers are remembered.
 
 
@@ -72,11 +75,10 @@ class DrivenArmScene:
     one degree of freedom, or effects do what is not in DrivenArm.
     """
 
-    # Time constant with which friction stops a joint, as a damper does, before it
-    # holds: 0 of a robot; MuJoCo's solver, as it comes, has 1 ms, and joints creep.
-    creep_sec = 0.0
-
     def __init__(self, scene: Scene):
+        # Time constant with which dry friction, not all of it yet, stops a joint as a
+        # damper does: 0 of a robot; MuJoCo's solver, as it comes, has 1 ms.
+        self.stops_sec = float(scene.tolerance.get(STOPS, 0.0))
         self.scene = scene = replace(scene, plant=replace(scene.plant, time_step=0.0))
         self._plants: dict[tuple, tuple[MultibodyPlant, JointTree]] = {}
         # Joints that nothing drives: a rotor needs an actuator there, too.
@@ -113,13 +115,12 @@ class DrivenArmScene:
             possible = KINDS[effect.kind].possible
             if possible is not None:
                 possible(effect, plant, every)
-        arm = DrivenArm(tree, **self._drives(plant, every))
         n = len(tree.parent)
-        q = plant.GetPositions(plant.CreateDefaultContext())
-        M = np.empty((n, n))
-        mass_and_bias(tree, NO_BODY_LAWS, 0.0, q, np.zeros(n), M, np.empty(n))
-        mobility = np.diag(np.linalg.inv(M))
-        return arm._replace(laws=self._held(arm.laws, mobility))
+        none = np.zeros((n, 3))
+        arm = DrivenArm(tree, soft=none, **self._drives(plant, every))
+        M, zero = np.empty((n, n)), np.zeros(n)  # Where MuJoCo takes it.
+        mass_and_bias(tree, NO_BODY_LAWS, 0.0, zero, zero, M, np.empty(n))
+        return self._held(arm, np.diag(np.linalg.inv(M)))
 
     @property
     def has_shapes(self) -> bool:
@@ -135,17 +136,22 @@ class DrivenArmScene:
             told,
         )
 
-    def _held(self, laws: JointLaws, mobility: np.ndarray) -> JointLaws:
+    def _held(self, arm: DrivenArm, mobility: np.ndarray) -> DrivenArm:
         """With dry friction that holds: below a speed that is no more than these
-        steps need, or with which a joint creeps in so far as the scene's does."""
-        p = laws.p.copy()
-        for j, kind in enumerate(laws.kind):
-            if int(kind) in FADES_AT:
-                at, i = FADES_AT[int(kind)], int(laws.joint[j])
-                most = np.abs(p[j, : min(at, 2)]).max()
-                creeps = self.creep_sec * most * mobility[i]
-                p[j, at] = max(HOLDS * p[j, at], creeps)
-        return laws._replace(p=p)
+        steps need, or softly."""
+        laws, p, soft = arm.laws, arm.laws.p.copy(), arm.soft.copy()
+        for j, (i, kind) in enumerate(zip(laws.joint, laws.kind, strict=True)):
+            if int(kind) not in FADES_AT:
+                continue
+            p[j, FADES_AT[int(kind)]] *= HOLDS
+            if self.stops_sec and LAWS[int(kind)] is coulomb_law:
+                soft[i, 0] += p[j, 0]
+                soft[i, 1:] = (
+                    1.0 / (self.stops_sec * mobility[i]),
+                    LEAD * self.stops_sec,
+                )
+                p[j, 0] = 0.0
+        return arm._replace(laws=laws._replace(p=p), soft=soft)
 
     def _plant(self, effects) -> tuple[MultibodyPlant, JointTree]:
         """A plant with these effects, and what of a DrivenArm it decides."""
@@ -224,11 +230,6 @@ class DrivenArmSimulation(SceneSimulation):
         self.tol = 1e-3
         self._own = len(scene.effects)
         self._arm = self.arms.arm(())
-
-    def set_creep(self, seconds: float) -> None:
-        """See DrivenArmScene.creep_sec."""
-        self.arms.creep_sec = seconds
-        self.set_effects(self._scene.effects)
 
     def set_effects(self, effects: Sequence[Effect]) -> None:
         """The scene's effects from now on, of which the scene's own come first."""

@@ -218,13 +218,12 @@ def _damping_signature(effect, model, motion, grid=None) -> list[Signature]:
 
 
 def _coulomb_signature(effect, model, motion, grid=None) -> list[Signature]:
-    joints = find_joints(effect, model.plant)
-    slow = velocity_unit(joints[0])
-    return [
-        at_joints(
-            effect, ["coulomb"], motion, joints, [lambda q, v, u: np.tanh(v / slow)]
-        )
-    ]
+    columns = np.zeros((*motion.v.shape, 1))
+    for joint in find_joints(effect, model.plant):
+        i = joint.velocity_start()
+        share = np.tanh(motion.v[:, i] / velocity_unit(joint))
+        columns[:, i, 0] = share if motion.dry is None else motion.dry[:, i]
+    return [without_momentum(effect, ["coulomb"], columns)]
 
 
 def _direction_signature(effect, model, motion, grid=None) -> list[Signature]:

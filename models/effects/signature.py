@@ -33,6 +33,8 @@ class Motion:
     effort: recorded effort of the actuators, commanded or measured as the caller
         decides; 0 at joints without an actuator.
     jerk: d/dt vd, for kinds that shift time; None: differences of vd.
+    dry: share of dry friction that acts, positive as v; None: all but where a joint is
+        slower than its friction's law says.
     """
 
     time: np.ndarray  # (n,) [s]
@@ -41,6 +43,7 @@ class Motion:
     vd: np.ndarray  # (n, n_v)
     effort: np.ndarray  # (n, n_v) [N m] or [N]
     jerk: np.ndarray | None = None  # (n, n_v)
+    dry: np.ndarray | None = None  # (n, n_v)
 
     def __post_init__(self):
         n = np.size(self.time)

@@ -93,6 +93,12 @@ class JointLaws(NamedTuple):
     p: np.ndarray  # (m, N_NUMBERS)
 
 
+def coulomb_of(laws: JointLaws) -> list[tuple[int, float, float]]:
+    """(joint, friction, speed below which it fades) of each Coulomb friction."""
+    each = zip(*laws, strict=True)
+    return [(int(i), p[0], p[1]) for i, k, p in each if LAWS[int(k)] is coulomb_law]
+
+
 def most_friction(laws: JointLaws, n: int) -> np.ndarray:
     """(n,) the most that laws of dry friction hold n joints with [N m] or [N]."""
     out = np.zeros(n)
