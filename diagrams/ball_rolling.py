@@ -48,7 +48,12 @@ from makebreak.diagrams.ball_rolling_config import (
 )
 from makebreak.diagrams.camera import camera_model
 from makebreak.diagrams.faults import faulty_lcs
-from makebreak.diagrams.learned_parameters import add_gap_std, add_parameter_learner
+from makebreak.diagrams.learned_parameters import (
+    add_gap_std,
+    add_parameter_learner,
+    add_past_state,
+    past_config,
+)
 from makebreak.diagrams.realism import draw_errors
 from makebreak.diagrams.recorder import record_station
 from makebreak.diagrams.sampled_contacts import (
@@ -103,6 +108,7 @@ from makebreak.systems.contact_mpc.path_target import PathTargetConfig
 from makebreak.systems.contact_mpc.residual_learner import ResidualLearner
 from makebreak.systems.contact_mpc.rolling_task import RollingTask
 from makebreak.systems.perception.ball_tracker import BallTracker
+from makebreak.systems.perception.past_state import PastState
 from makebreak.systems.perception.state_estimator import (
     StateEstimator,
     StateEstimatorConfig,
@@ -119,8 +125,8 @@ ESTIMATE, ARM_TICK = CONTROL / 3.0, 0.001
 # millisecond between two steps of the plant: no value waits for the next period. (But
 # for r_comp in the task's landing height, which may be 12.5 ms old.)
 OFFSET = dict(
-    tracker=1e-4, estimator=2e-4, target=2.5e-4, task=3e-4, lcs=3e-4, learner=3.5e-4,
-    sampler=3.5e-4, c3=4e-4, reference=4.5e-4, impedance=7e-4,
+    tracker=1e-4, estimator=2e-4, target=2.5e-4, past=2.5e-4, task=3e-4, lcs=3e-4,
+    learner=3.5e-4, sampler=3.5e-4, c3=4e-4, reference=4.5e-4, impedance=7e-4,
 )  # fmt: skip
 BALL_CHANNELS = ("ball.ball.x", "ball.ball.y")  # What a camera above sees of it.
 
@@ -553,15 +559,18 @@ def _learn_parameters(rig: _Rig) -> _Learned:
     """Mass, frictions and gap, where the plan is made with them."""
     pairs = _pairs(rig.config.planner.friction, ContactPair().tangent)
     settings = parameter_learner_config(
-        rig.config, pairs, learned_parameters(rig.config)
+        rig.config, rig.model.ball_radius, pairs, learned_parameters(rig.config)
     )
     model = make_tip_and_ball(rig.model)[0]
     learner = ParameterLearner(model, settings, LEARN, OFFSET["learner"])
     users = [rig.lcs["plan"], rig.lcs["command"]]
-    r_comp = add_parameter_learner(
-        rig.builder, learner, rig.estimator, "window_valid", users, N_TIP, LEARN,
-        "u_with_force",
-    )  # fmt: skip
+    state: LeafSystem = rig.estimator
+    if rig.builder.HasSubsystemNamed("ball_tracker"):
+        tracker = rig.builder.GetSubsystemByName("ball_tracker")
+        of = past_config(rig.model.ball_radius, OFFSET["past"], TRACK)
+        past = PastState(of, is_ball=True)
+        state = add_past_state(rig.builder, past, tracker, rig.estimator)
+    r_comp = add_parameter_learner(rig.builder, learner, state, users, N_TIP, LEARN)
     return _Learned(r_comp, add_gap_std(rig.builder, learner, LEARN))
 
 

@@ -375,14 +375,21 @@ def learned_parameters(config: BallRollingConfig) -> list[Parameter]:
 
 
 def parameter_learner_config(
-    config: BallRollingConfig, pairs: list[ContactPair], items: list[Parameter]
+    config: BallRollingConfig,
+    ball_radius: float,
+    pairs: list[ContactPair],
+    items: list[Parameter],
 ) -> ParameterLearnerConfig:
-    """The weights are those of the residual's learner."""
-    of_residual = learner_config(config.learning)
+    """The weights are those of the residual's learner; the tip's motion along the table
+    weighs as the ball's, and the ball's turning as its rolling."""
+    Q_d = np.array(learner_config(config.learning).Q_d)
+    ball = Q_d[V_BALL.start]
+    Q_d[V_TIP.start : V_TIP.start + 2] = ball
+    Q_d[W_BALL.start : W_BALL.start + 2] = ball * ball_radius**2
     return ParameterLearnerConfig(
         pairs,
         items,
-        of_residual.Q_d,
+        Q_d.tolist(),
         config.parameters.contact_std,
         slip_noise=config.learning.slip_noise,
     )

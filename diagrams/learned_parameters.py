@@ -1,7 +1,9 @@
-"""The wiring of a ParameterLearner beside planners that know gaps as a residual."""
+"""The wiring of learners: what they learn from, and of a ParameterLearner beside
+planners that know gaps as a residual."""
 
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from pydrake.systems.framework import (
@@ -16,6 +18,53 @@ from pydrake.systems.primitives import MatrixGain
 from makebreak.diagrams import wiring
 from makebreak.systems.contact_mpc.multibody.model_parameters import Parameter
 from makebreak.systems.contact_mpc.parameter_learner import ParameterLearner
+from makebreak.systems.perception.past_state import PastState, PastStateConfig
+
+LONGEST = 1.0  # Age of the oldest reading in use [s].
+
+
+def past_config(
+    height: float, offset_sec: float, reading_sec: float, delay_sec: float = 0.0
+) -> PastStateConfig:
+    """Config of PastState: how far back a learner looks, so that all readings about
+    that time have arrived.
+
+    Args: height: of the object's frame [m]; reading_sec: period of the readings [s];
+        delay_sec: by which they are late [s].
+    Raises: ValueError for readings that are too rare or too late.
+    """
+    plain = PastStateConfig(height=height, offset_sec=offset_sec)
+    # A parabola needs two readings on either side, and one is lost between ticks.
+    half_width = max(plain.half_width, 2.5 * reading_sec)
+    wait = delay_sec + reading_sec + half_width
+    if wait + half_width > LONGEST:
+        raise ValueError(
+            f"pose: period_sec {reading_sec:g}, delay_sec {delay_sec:g} are too long "
+            "to learn from; expected less, or adapt=false"
+        )
+    ticks = max(plain.ticks, int(np.ceil(wait / plain.period_sec - 1e-9)))
+    return replace(plain, ticks=ticks, half_width=half_width)
+
+
+def add_past_state(
+    builder: DiagramBuilder, past: PastState, sensor: LeafSystem, estimator: LeafSystem
+) -> PastState:
+    """Adds `past_state`: of a sensor's readings beside the estimator's tip."""
+    builder.AddNamedSystem("past_state", past)
+    for source, name, port in (
+        (estimator, "x", "x"), (estimator, "u_with_force_now", "u"),
+        (sensor, "reading", "reading"),
+    ):  # fmt: skip
+        wiring.connect(builder, source, name, past, port)
+    return past
+
+
+def u_and_ready(state: LeafSystem) -> tuple[str, str]:
+    """Ports of what gives samples, a PastState or a StateEstimator: the input, and
+    whether the sample is known."""
+    if isinstance(state, PastState):
+        return "u_measured", "ready"
+    return "u_with_force", "window_valid"
 
 
 def to_learn(
@@ -41,21 +90,19 @@ def add_parameter_learner(
     builder: DiagramBuilder,
     learner: ParameterLearner,
     state: LeafSystem,
-    ready: str,
     users: Sequence[LeafSystem],
     rows: int,
     dt_sec: float,
-    u: str = "u_measured",
 ) -> OutputPort:
     """Adds `parameter_learner`, and gives what it learns but the gap to the users.
 
-    Args: state: has x and the ports `u` and `ready`; users: their port `parameters` has
-        all but the gap, in order, and the first one builds the LCS; rows: the first
-        ones of it, whose gap is learned; dt_sec: time step over which a
-        residual is a velocity [s].
+    Args: state: of u_and_ready; users: their port `parameters` has all but the gap, in
+        order, and the first one builds the LCS; rows: the first ones of it, whose gap
+        is learned; dt_sec: time step over which a residual is a velocity [s].
     Returns: the gap as r_comp (n_lam,) [m/s], of the system `learned_residual`.
     """
     builder.AddNamedSystem("parameter_learner", learner)
+    u, ready = u_and_ready(state)
     for name, port in (
         ("x", "x"), (u, "u_measured"), (ready, "enable"),
     ):  # fmt: skip

@@ -29,7 +29,12 @@ from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 from makebreak.diagrams import wiring
 from makebreak.diagrams.camera import camera_model
 from makebreak.diagrams.fault_kinds import read_faults
-from makebreak.diagrams.learned_parameters import add_parameter_learner
+from makebreak.diagrams.learned_parameters import (
+    add_parameter_learner,
+    add_past_state,
+    past_config,
+    u_and_ready,
+)
 from makebreak.diagrams.push_object_config import (
     ARM_TICK,
     CONTROL,
@@ -49,7 +54,6 @@ from makebreak.diagrams.push_object_config import (
     learned_parameters,
     learner_config,
     parameter_learner_config,
-    past_config,
     rolling_axis,
 )
 from makebreak.diagrams.push_object_scenes import (
@@ -166,8 +170,12 @@ def make_push_object(
     _connect_estimates(builder, station, sensor, estimator)
     past = estimator
     learns = config.adapt and config.learner != "none"
-    if learns and sensor.HasOutputPort("readings"):
-        past = _add_past_state(builder, config, model, sensor, estimator)
+    if learns and config.pose_from == "sensor":  # The camera gives no readings.
+        of = past_config(
+            model.height, OFFSET["past"], config.pose.period_sec, config.pose.delay_sec
+        )
+        axis = rolling_axis(model.spec) or np.zeros(3)
+        past = add_past_state(builder, PastState(of, axis), sensor, estimator)
     _connect_lcs_builders(builder, lcs, estimator, past)
     if learns:
         if items:
@@ -179,9 +187,8 @@ def make_push_object(
                 LEARN,
                 OFFSET["learner"],
             )
-            u, ready = _u_and_ready(past)
             r_comp = add_parameter_learner(
-                builder, parameter_learner, past, ready, users, N_TIP, LEARN, u
+                builder, parameter_learner, past, users, N_TIP, LEARN
             )
         else:
             learner = _add_learner(builder, config, lcs["learn"], past)
@@ -489,32 +496,9 @@ def _add_arm_control(
     return reference, impedance
 
 
-def _add_past_state(builder, config, model, sensor, estimator) -> PastState:
-    """The state at a past time, at which delayed readings of the pose are known."""
-    past = builder.AddNamedSystem(
-        "past_state",
-        PastState(
-            past_config(config.pose, model.height),
-            rolling_axis(model.spec) or np.zeros(3),
-        ),
-    )
-    connect = partial(wiring.connect, builder)
-    connect(estimator, "x", past, "x")
-    connect(estimator, "u_with_force_now", past, "u")
-    connect(sensor, "readings", past, "readings")
-    return past
-
-
-def _u_and_ready(past: PastState | StateEstimator) -> tuple[str, str]:
-    """Ports of what gives samples: the input, and whether the sample is known."""
-    if isinstance(past, PastState):
-        return "u_measured", "ready"
-    return "u_with_force", "window_valid"
-
-
 def _add_learner(builder, config, lcs, past) -> ResidualLearner:
     """Args: past: the PastState, or the estimator where there is none."""
-    u, ready = _u_and_ready(past)
+    u, ready = u_and_ready(past)
     learner = builder.AddNamedSystem(
         "residual_learner",
         ResidualLearner(

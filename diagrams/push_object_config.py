@@ -43,8 +43,7 @@ from makebreak.systems.contact_mpc.residual_learner import (
     PosteriorConfig,
     ResidualLearnerConfig,
 )
-from makebreak.systems.perception.past_state import PastStateConfig
-from makebreak.systems.perception.pose_sensor import KEPT_SEC, PoseSensorConfig
+from makebreak.systems.perception.pose_sensor import PoseSensorConfig
 from makebreak.systems.perception.pose_tracker import PoseTrackerConfig
 
 PUSH_OBJECT = str(MODELS / "push_object.scene.yaml")
@@ -335,25 +334,3 @@ def parameter_learner_config(
     Q_d[V_BALL.start : V_BALL.start + 2] = own.weight
     Q_d[W_BALL.start + 2] = own.weight * own.turn_radius**2
     return ParameterLearnerConfig(pairs, items, Q_d.tolist(), own.contact_std)
-
-
-def past_config(pose: PoseSensorConfig, height: float) -> PastStateConfig:
-    """Config of PastState: how far back the learner looks, so that all readings about
-    that time have arrived.
-
-    Args: height: of the object's frame [m].
-    Raises: ValueError for readings that are too rare or too late.
-    """
-    plain = PastStateConfig(
-        height=height, period_sec=LEARN, tick_sec=ESTIMATE, offset_sec=OFFSET["past"]
-    )
-    # A parabola needs two readings on either side, and one is lost between ticks.
-    half_width = max(plain.half_width, 2.5 * pose.period_sec)
-    wait = pose.delay_sec + pose.period_sec + half_width
-    if wait + half_width > KEPT_SEC:
-        raise ValueError(
-            f"pose: period_sec {pose.period_sec:g}, delay_sec {pose.delay_sec:g} are "
-            "too long to learn from; expected less, or adapt=false"
-        )
-    ticks = max(plain.ticks, int(np.ceil(wait / LEARN - 1e-9)))
-    return replace(plain, ticks=ticks, half_width=half_width)

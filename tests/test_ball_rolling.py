@@ -753,6 +753,14 @@ def test_the_learner_of_parameters_is_wired_and_runs():
         system = diagram.GetSubsystemByName(name)
         return system.GetInputPort(port).Eval(system.GetMyContextFromRoot(context))
 
+    past = diagram.GetSubsystemByName("past_state")
+    np.testing.assert_array_equal(  # Tip, ball and force of one moment and one filter.
+        read("parameter_learner", "x"),
+        past.GetOutputPort("x").Eval(past.GetMyContextFromRoot(context)),
+    )
+    weights = learner._Q_d[[10, 11, 12, 13, 14, 15, 16, 17, 18]]
+    ball = 2e4 * np.array([0.0365**2, 0.0365**2, 0.0, 1.0, 1.0, 0.0])
+    np.testing.assert_allclose(weights, [2e4, 2e4, 1e5, *ball])
     np.testing.assert_allclose(read("lcs_plan", "parameters")[3], 1.5e-4, rtol=1e-6)
     np.testing.assert_allclose(read("rolling_task", "r_comp")[:4], 0.1, rtol=1e-6)
     np.testing.assert_allclose(read("rolling_task", "r_std"), [1e-4 * 0.1], rtol=1e-6)

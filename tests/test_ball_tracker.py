@@ -369,7 +369,7 @@ def test_what_is_outside_its_region_changes_nothing():
 
 def test_before_the_first_picture_nothing_is_seen_and_all_is_finite():
     rig = Rig()
-    assert rig.seen == 0.0 and rig.status == NOT_FOUND
+    assert rig.seen == 0.0 and rig.status == NOT_FOUND and rig.reading[0] == -1.0
     np.testing.assert_array_equal(rig.p_WB, [0.5, 0.0, RADIUS])
     np.testing.assert_array_equal(rig.v_WB, np.zeros(3))
 
@@ -410,7 +410,8 @@ def test_a_lost_ball_is_said_held_and_found_again():
     rig = Rig()
     v = np.array([0.1, 0.0, 0.0])
     for k in range(40):
-        rig.show(sketch(np.array([0.45, 0.0, RADIUS]) + 0.0125 * k * v))
+        p_seen = np.array([0.45, 0.0, RADIUS]) + 0.0125 * k * v
+        rig.show(sketch(p_seen))
     p_last, v_last, std_last = rig.p_WB, rig.v_WB, rig.position_std
     assert v_last[0] > 0.05
     std = []
@@ -422,10 +423,13 @@ def test_a_lost_ball_is_said_held_and_found_again():
         np.testing.assert_array_equal(rig.v_WB, v_last if held else np.zeros(3))
         std.append(rig.position_std)
     assert (np.diff([std_last, *std]) > 0.0).all()
+    np.testing.assert_allclose(rig.reading[:4], [0.4875, *p_seen], atol=5e-4)
     elsewhere = np.array([0.6, -0.12, RADIUS])
     rig.show(sketch(elsewhere))
     assert rig.seen == 1.0
     np.testing.assert_allclose(rig.p_WB, elsewhere, atol=5e-4)
+    np.testing.assert_allclose(rig.reading[:4], [1.0, *elsewhere], atol=5e-4)
+    np.testing.assert_array_equal(rig.reading[4:], [1.0, 0.0, 0.0, 0.0])
     rig.show(sketch(elsewhere))
     np.testing.assert_allclose(rig.v_WB, 0.0, atol=0.05)
 

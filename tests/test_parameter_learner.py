@@ -12,6 +12,7 @@ from makebreak.benchmarks import parameter_learner as bench
 from makebreak.benchmarks.plants import diagram_of
 from makebreak.diagrams.push_object_config import contact_pairs
 from makebreak.models.pushed_object import PushedObject, make_tip_and_object
+from makebreak.models.tip_and_ball import TipAndBall, make_tip_and_ball
 from makebreak.systems.contact_mpc.careful_goal import CarefulGoal, CarefulGoalConfig
 from makebreak.systems.contact_mpc.lcs_builder import (
     AnitescuLcs,
@@ -20,7 +21,13 @@ from makebreak.systems.contact_mpc.lcs_builder import (
     LcsBuilderConfig,
 )
 from makebreak.systems.contact_mpc.multibody.model_parameters import Parameter
-from makebreak.systems.contact_mpc.numerics.ball_state import P_BALL, P_TIP, V_BALL
+from makebreak.systems.contact_mpc.numerics.ball_state import (
+    N_X,
+    P_BALL,
+    P_TIP,
+    V_BALL,
+    V_TIP,
+)
 from makebreak.systems.contact_mpc.numerics.lcs import LCS, simulate
 from makebreak.systems.contact_mpc.numerics.parameter_posterior import (
     Belief,
@@ -481,6 +488,35 @@ def test_what_sticks_tells_of_friction_only_beyond_the_noise():
             expected = 1.0 if counts or not one_sided else 0.0
             np.testing.assert_allclose(information, expected)
             np.testing.assert_allclose(gradient, -off * expected)
+
+
+def test_what_is_not_felt_tells_only_that_the_gap_is_larger():
+    """A tip glides 4 mm inside the modelled ball and 6 mm above the real one, and feels
+    the noise of a force alone. (A gap of 4.0 +- 0.4 mm was learned.)"""
+    model, rng = TipAndBall(), np.random.default_rng(0)
+    reach, Q_d = model.tip_radius + model.ball_radius, np.zeros(N_X)
+    Q_d[V_TIP] = 1e5
+    learner = ParameterLearner(
+        make_tip_and_ball(model)[0],
+        ParameterLearnerConfig(
+            [
+                ContactPair("tip::tip", "ball::ball", 1.0),
+                ContactPair("ball::ball", "table::table", 1.0),
+            ],
+            [Parameter("gap", 0.005, pairs=[0])],
+            Q_d.tolist(),
+        ),
+        0.05,
+    )
+    memory = learner._memory_of(learner.CreateDefaultContext())
+    for k in range(40):
+        x = learner.model.x_default.copy()
+        x[P_BALL] = [0.0, 0.0, model.ball_radius]
+        x[P_TIP] = [2e-4 * (k - 20), 0.0, x[P_BALL][2] + reach - 0.004]
+        x[V_TIP] = [4e-3, 0.0, 0.0] + 3e-3 * rng.normal(size=3)
+        memory = learner._after(memory, x, np.zeros(3), True)
+    gap, std = 5e-3 * memory.belief.mean[0], 5e-3 * memory.belief.std[0]
+    assert gap > 3e-3 and gap - 1.645 * std < 0.010 < gap + 1.645 * std
 
 
 @pytest.mark.parametrize("degrees", [0.0, 22.0, 45.0])

@@ -101,14 +101,14 @@ class Moving(LeafSystem):
         output.SetFromVector(self.force(context.get_time()))
 
 
-def past_of(world):
+def past_of(world, past=None):
     builder = DiagramBuilder()
     builder.AddSystem(world)
     sensor = builder.AddSystem(PoseSensor(PoseSensorConfig(noise=[0.0, 0.0]), 1))
-    past = builder.AddSystem(PastState(PastStateConfig(height=0.02)))
+    past = builder.AddSystem(past or PastState(PastStateConfig(height=0.02)))
     for source, output, target, port in (
         (world, "body_poses", sensor, "body_poses"), (world, "x", past, "x"),
-        (world, "u", past, "u"), (sensor, "readings", past, "readings"),
+        (world, "u", past, "u"), (sensor, "reading", past, "reading"),
     ):  # fmt: skip
         builder.Connect(source.GetOutputPort(output), target.GetInputPort(port))
     diagram = builder.Build()
@@ -186,3 +186,18 @@ def test_a_period_or_a_width_out_of_range_is_refused():
         PastState(PastStateConfig(half_width=0.0))
     with pytest.raises(ValueError, match="period_sec is 0.05, expected a multiple"):
         PastState(PastStateConfig(tick_sec=0.03))
+
+
+def test_a_ball_rolls_without_slipping_and_turns_as_far_as_it_moves():
+    """Its readings say nothing of how it is turned (q is what the table makes of it),
+    and the learner takes the mean speed of a step from the change of the pose."""
+    past = PastState(PastStateConfig(height=0.02), is_ball=True)
+    simulator, now = past_of(Moving(), past)
+    simulator.AdvanceTo(1.01)
+    before = now("x")
+    simulator.AdvanceTo(1.06)
+    x, t = now("x"), 0.85
+    np.testing.assert_allclose(x[V_BALL], A * t, atol=1e-9)
+    np.testing.assert_allclose(x[W_BALL], [0.2 * t / 0.02, 0.4 * t / 0.02, 0.0])
+    turn, way = turn_between(before[Q_BALL], x[Q_BALL]), (x - before)[P_BALL]
+    np.testing.assert_allclose(turn, [-way[1] / 0.02, way[0] / 0.02, 0.0], atol=1e-9)

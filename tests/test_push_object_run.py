@@ -10,12 +10,12 @@ from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.benchmarks import parameter_push
 from makebreak.diagrams.camera import CameraConfig
+from makebreak.diagrams.learned_parameters import past_config
 from makebreak.diagrams.push_object import (
     PushModelConfig,
     PushObjectConfig,
     make_push_object,
 )
-from makebreak.diagrams.push_object_config import past_config
 from makebreak.diagrams.push_object_scenes import (
     model_object,
     model_scene,
@@ -40,7 +40,7 @@ from makebreak.scripts.experiments.push_object import (
 from makebreak.scripts.runner.session import Session
 from makebreak.scripts.runner.settings import apply_settings
 from makebreak.systems.perception.numerics.past_state import pose_at
-from makebreak.systems.perception.pose_sensor import KEPT_SEC, PoseSensorConfig
+from makebreak.systems.perception.pose_sensor import PoseSensorConfig
 
 GOAL = np.array([0.5, 0.1, 3.0])
 POSE = [1.0, 0.0, 0.0, 0.0, 0.5, 0.0, 0.02]
@@ -301,9 +301,9 @@ def test_camera_and_sensor_are_the_only_ways_from_the_world():
 @pytest.mark.parametrize("hz", [8.0, 10.0, 15.0, 30.0, 60.0, 100.0, 240.0])
 @pytest.mark.parametrize("delay", [0.0, 0.02, 0.15])
 def test_the_learner_finds_its_readings_at_any_rate(hz, delay):
-    """What is kept of the readings at any tick is enough for the moment that counts."""
+    """What has arrived of the readings is enough for the moment that counts."""
     period = 1.0 / hz
-    past = past_config(PoseSensorConfig(delay_sec=delay, period_sec=period), 0.02)
+    past = past_config(0.02, 0.0, period, delay)
     ready = []
     for k in range(60, 100):
         t = k * past.period_sec
@@ -311,7 +311,7 @@ def test_the_learner_finds_its_readings_at_any_rate(hz, delay):
         known = [
             (s, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
             for s in times
-            if t - KEPT_SEC < s and s + delay <= t - period + 1e-9
+            if s + delay <= t - period + 1e-9
         ]
         at = t - past.ticks * past.period_sec
         ready.append(pose_at(at, known, past.half_width) is not None)

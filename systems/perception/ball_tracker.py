@@ -30,7 +30,7 @@ START_SPEED = 0.3  # Standard deviation of the velocity after a restart [m/s].
 
 # Layout of the state; then, per motion model, its mean, covariance and probability.
 _P, _V, _COVARIANCE = slice(0, 2), slice(2, 4), slice(4, 7)
-_UNSEEN_SEC, _N_OUTLIERS, _STATUS, _MODELS = 7, 8, 9, 10
+_UNSEEN_SEC, _N_OUTLIERS, _STATUS, _READING, _MODELS = 7, 8, 9, slice(10, 13), 13
 _PER_MODEL = 4 + 3 + 1
 
 
@@ -70,7 +70,9 @@ class BallTracker(LeafSystem):
              lies lower, and so at another point of the ray on which it is seen.
     Outputs: p_WB (3,) [m]; v_WB (3,) [m/s]; seen (1,): 1 if the last image showed the
              ball at a plausible place, else 0; status (1,): TRACKED, NOT_FOUND, OUTLIER
-             or WRONG_IMAGE; position_std (1,) [m]: of x and y of p_WB; region (3,) of
+             or WRONG_IMAGE; position_std (1,) [m]: of x and y of p_WB; reading (8,):
+             the last one that was tracked, as measured: time [s], p (3,), and the
+             identity for q, which nobody sees; time -1 before the first; region (3,) of
              the next image that is looked at: centre and half its side [px], not a
              number: all of it.
 
@@ -123,6 +125,7 @@ class BallTracker(LeafSystem):
         start[_P] = camera.p_WC[:2]
         start[_COVARIANCE] = 1.0, 0.0, START_SPEED**2
         start[_UNSEEN_SEC], start[_STATUS] = 2.0 * HOLD_SEC, NOT_FOUND
+        start[_READING] = -1.0, 0.0, 0.0
         at, speed, P = camera.p_WC[:2], np.zeros(2), start[_COVARIANCE]
         start[_MODELS:] = _flat(interacting_models.start(at, speed, P, len(densities)))
         self._state = self.DeclareDiscreteState(start)
@@ -133,6 +136,7 @@ class BallTracker(LeafSystem):
             ("seen", 1, self._seen),
             ("status", 1, self._status),
             ("position_std", 1, self._position_std),
+            ("reading", 8, self._last_reading),
             ("region", 3, self._region),
         ):
             self.DeclareVectorOutputPort(name, size, calc, prerequisites_of_calc=ticket)
@@ -185,8 +189,10 @@ class BallTracker(LeafSystem):
             estimate = self._restarted(measured)
         else:
             n_outliers, status = state[_N_OUTLIERS] + 1, OUTLIER
+        reading = state[_READING]
         if status == TRACKED:
             unseen_sec = 0.0
+            reading = np.append(context.get_time(), np.array(measured, dtype=float))
         else:
             # The position is held while its variance grows.
             unseen_sec = min(state[_UNSEEN_SEC] + c.period_sec, 2.0 * HOLD_SEC)
@@ -195,7 +201,7 @@ class BallTracker(LeafSystem):
             estimate = interacting_models.start(state[_P], v, P, len(self._densities))
         p, v, P = interacting_models.combined(*estimate)
         state = np.concatenate(
-            [p, v, P, [unseen_sec, n_outliers, status], _flat(estimate)]
+            [p, v, P, [unseen_sec, n_outliers, status], reading, _flat(estimate)]
         )
         if np.isfinite(state).all():
             discrete_state.set_value(self._state, state)
@@ -238,6 +244,10 @@ class BallTracker(LeafSystem):
 
     def _position_std(self, context, output):
         output.SetAtIndex(0, np.sqrt(self._get(context)[_COVARIANCE][0]))
+
+    def _last_reading(self, context, output):
+        z = self._config.table_z + self._config.ball_radius
+        output.SetFromVector([*self._get(context)[_READING], z, 1.0, 0.0, 0.0, 0.0])
 
     def _region(self, context, output):
         state, c = self._get(context), self._config

@@ -14,10 +14,11 @@ from makebreak.systems.contact_mpc.numerics.ball_state import (
     V_BALL,
     V_TIP,
     W_BALL,
+    rolling_velocity,
 )
 from makebreak.systems.numerics.timing import timed
 from makebreak.systems.perception.numerics.past_state import pose_at
-from makebreak.systems.perception.numerics.pose_filter import on_the_table
+from makebreak.systems.perception.numerics.pose_filter import on_the_table, turned
 
 
 @dataclass
@@ -34,10 +35,12 @@ class PastStateConfig:
 
 @dataclass(frozen=True, eq=False)
 class _Memory:
-    """Of the last ticks: the time, and the tip's position beside the input's second
-    integral over time, which is to the input what the position is to the acceleration.
+    """The last readings; and of the last ticks the time, and the tip's position beside
+    the input's second integral over time, which is to the input what the position is to
+    the acceleration.
     """
 
+    readings: tuple = ()  # (time, p (3,), q (4,)) of each, oldest first.
     ticks: tuple = ()  # (time, (6,)) of each.
     rate: np.ndarray = field(default_factory=lambda: np.zeros(3))  # First integral.
     impulse: np.ndarray | None = None  # Filtered, at the last time that was known.
@@ -50,15 +53,23 @@ class _Memory:
         times, values = zip(*self.ticks, strict=True) if self.ticks else ((), ())
         return times, np.reshape(values, (-1, 6))
 
+    def with_reading(self, reading, since) -> "_Memory":
+        """With the last reading, unless it is known, without those before `since`."""
+        t, p, q = reading[0], reading[1:4], reading[4:]
+        if t < 0.0 or self.readings and t <= self.readings[-1][0]:
+            return self
+        kept = tuple(one for one in self.readings if one[0] >= since)
+        return replace(self, readings=(*kept, (t, p, q)))
+
     def with_tick(self, t, p_tip, u, dt, n_kept: int) -> "_Memory":
-        """A tick later; empty after one that is not finite."""
+        """A tick later; without those before one that is not finite."""
         if not (np.isfinite(p_tip).all() and np.isfinite(u).all()):
-            return _Memory()
+            return _Memory(self.readings)
         rate, twice = self.rate + dt * u, np.zeros(3)
         if self.ticks:
             twice = self.ticks[-1][1][3:] + 0.5 * dt * (self.rate + rate)
         ticks = (*self.ticks, (t, np.append(p_tip, twice)))[-n_kept:]
-        return _Memory(ticks, rate, self.impulse)
+        return _Memory(self.readings, ticks, rate, self.impulse)
 
 
 class PastState(LeafSystem):
@@ -68,17 +79,20 @@ class PastState(LeafSystem):
     and the input go through the same filter (numerics/past_state.py). So tip and object
     are of the same time, which a filter's present estimates are not while the object's
     motion changes, and a force lasts as long as the motion that it explains. The
-    object is laid on the table.
+    object is laid on the table. A ball, of which nobody sees how it is turned, rolls
+    there without slipping.
 
     Inputs:  x (19,) of contact_mpc/numerics/ball_state.py (only the tip's position is
-             used); u (3,): over the last tick [N]; readings (abstract) of PoseSensor.
+             used); u (3,): over the last tick [N]; reading (8,): the last one that has
+             arrived: time [s], p (3,), q (4,); its time is -1 before the first.
     Outputs: x (19,) of that time, u_measured (3,): filtered, over the period before it
              (zero at the first known time); ready (1,): 1 if both are known, else they
              are the last known ones.
     """
 
-    def __init__(self, config: PastStateConfig, axis=(0.0, 0.0, 0.0)):
-        """Args: axis: about which the object rolls (pose_filter.on_the_table).
+    def __init__(self, config: PastStateConfig, axis=(0.0, 0.0, 0.0), is_ball=False):
+        """Args: axis: about which the object rolls (pose_filter.on_the_table); is_ball:
+            whether it is a ball of radius `height`.
 
         Raises: ValueError for a setting out of range.
         """
@@ -98,12 +112,13 @@ class PastState(LeafSystem):
             )
         self._every = round(every)
         # Ticks that the parabola of the oldest time reaches over, and one more.
-        span = config.ticks * config.period_sec + config.half_width
-        self._n_kept = int(np.ceil(span / config.tick_sec)) + 2
+        self._span = config.ticks * config.period_sec + config.half_width
+        self._n_kept = int(np.ceil(self._span / config.tick_sec)) + 2
         self._config, self._axis = config, np.array(axis, dtype=float)
+        self._is_ball = is_ball
         self._x = self.DeclareVectorInputPort("x", N_X)
         self._u = self.DeclareVectorInputPort("u", 3)
-        self._readings = self.DeclareAbstractInputPort("readings", Value[object](()))
+        self._reading = self.DeclareVectorInputPort("reading", 8)
         self._memory = self.DeclareAbstractState(Value[object](_Memory()))
         at_rest = np.zeros(N_X)
         at_rest[Q_BALL.start] = 1.0
@@ -123,11 +138,11 @@ class PastState(LeafSystem):
         memory = context.get_abstract_state(int(self._memory)).get_value()
         x, u = (np.array(port.Eval(context)) for port in (self._x, self._u))
         memory = memory.with_tick(t, x[P_TIP], u, c.tick_sec, self._n_kept)
+        reading = self._reading.Eval(context).copy()
+        memory = memory.with_reading(reading, t - self._span - c.period_sec)
         if round((t - c.offset_sec) / c.tick_sec) % self._every == 0:
             at = t - c.ticks * c.period_sec
-            found = pose_at(
-                at, self._readings.Eval(context), c.half_width, memory.beside
-            )
+            found = pose_at(at, memory.readings, c.half_width, memory.beside)
             discrete = state.get_mutable_discrete_state()
             discrete.set_value(int(self._ready), [0.0 if found is None else 1.0])
             impulse = None
@@ -139,8 +154,11 @@ class PastState(LeafSystem):
 
     def _put(self, discrete, found, impulse, before) -> None:
         p, v, q, w, beside, rates = found
-        p, v, q, w = on_the_table(0.0, p, v, q, w, self._config.height, self._axis)
-        past = np.zeros(N_X)
+        height, past = self._config.height, np.zeros(N_X)
+        p, v, q, w = on_the_table(0.0, p, v, q, w, height, self._axis)
+        if self._is_ball:
+            last, w = discrete.value(int(self._past)), rolling_velocity(v, height)
+            q = turned(last[Q_BALL], rolling_velocity(p - last[P_BALL], height))
         past[P_TIP], past[V_TIP] = beside[:3], rates[:3]
         past[P_BALL], past[V_BALL], past[Q_BALL], past[W_BALL] = p, v, q, w
         force = np.zeros(3)

@@ -20,8 +20,6 @@ from makebreak.systems.perception.numerics.pose_filter import (
     turned,
 )
 
-KEPT_SEC = 1.0  # Age up to which readings are kept.
-
 
 @dataclass
 class PoseSensorConfig:
@@ -55,7 +53,7 @@ class _Memory:
     copy each array."""
 
     late: tuple = ()  # Readings that have not arrived yet, oldest first.
-    known: tuple = ()  # Readings of the last KEPT_SEC that have, oldest first.
+    known: tuple | None = None  # The last one that has.
     pose: PoseEstimate | None = None  # The filter's at the last of them.
     # Of a rolling object.
     rolling: interacting_models.Estimate | tuple[()] = ()
@@ -74,9 +72,8 @@ class PoseSensor(LeafSystem):
 
     Inputs:  body_poses (abstract) of a MultibodyPlant.
     Outputs: p_WB (3,) [m]; q_WB (4,) [w x y z]; v_WB (3,) [m/s]; w_WB (3,) [rad/s];
-             seen (1,): 1 after the first reading; readings (abstract): those of the
-             last KEPT_SEC that have arrived, as measured: (time [s], p (3,), q (4,));
-             reading (8,): the last of them; its time is -1 before the first.
+             seen (1,): 1 after the first reading; reading (8,): the last one that has
+             arrived, as measured: time [s], p (3,), q (4,); time -1 before the first.
 
     Args: config; body: its index in body_poses; seed: of the noise.
     Raises: ValueError for a setting out of range.
@@ -121,9 +118,6 @@ class PoseSensor(LeafSystem):
             now = read | {self.time_ticket()}
             self.DeclareVectorOutputPort(name, size, self._calc(i), now)
         self.DeclareVectorOutputPort("seen", 1, self._calc_seen, read)
-        self.DeclareAbstractOutputPort(
-            "readings", lambda: Value[object](()), self._calc_readings, read
-        )
         self.DeclareVectorOutputPort("reading", 8, self._calc_reading, read)
         self.DeclarePeriodicUnrestrictedUpdateEvent(
             config.period_sec, config.offset_sec, self._update
@@ -146,8 +140,8 @@ class PoseSensor(LeafSystem):
         pose, rolling = memory.pose, memory.rolling
         std = np.maximum(c.noise, 1e-6)  # The filter divides by it.
         while late and late[0][0] <= t - c.delay_sec + 1e-9:
-            known = (*known, late[0])
-            (at, p, q), late = late[0], late[1:]
+            known, late = late[0], late[1:]
+            at, p, q = known
             if pose is None:
                 pose = first_pose(at, p, q, std, (0.1, 1.0))
             else:
@@ -158,7 +152,6 @@ class PoseSensor(LeafSystem):
                 pose = pose._replace(
                     p=np.array([x, y, pose.p[2]]), v=np.array([*v, 0.0])
                 )
-        known = tuple(one for one in known if one[0] > t - KEPT_SEC) or known[-1:]
         memory = _Memory(late, known, pose, rolling)
         state.get_mutable_abstract_state(int(self._memory)).set_value(memory)
 
@@ -192,12 +185,9 @@ class PoseSensor(LeafSystem):
 
         return calc
 
-    def _calc_readings(self, context, output):
-        output.set_value(self._memory_of(context).known)
-
     def _calc_reading(self, context, output):
-        known = self._memory_of(context).known
-        t, p, q = known[-1] if known else (-1.0, np.zeros(3), [1.0, 0.0, 0.0, 0.0])
+        none = -1.0, np.zeros(3), [1.0, 0.0, 0.0, 0.0]
+        t, p, q = self._memory_of(context).known or none
         output.SetFromVector([t, *p, *q])
 
     def _calc_seen(self, context, output):

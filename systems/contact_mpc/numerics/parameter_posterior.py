@@ -217,6 +217,16 @@ def changes_by(lcs: LCS, other: LCS, sample: Sample, loss: Loss, lam):
     return z_other - z + dD @ lam, q_other - q + dF @ lam
 
 
+def felt(found: Explained, root) -> np.ndarray:
+    """(n_lam,) bool: rows of the contacts whose force is BEYOND_NOISE, as root (n_x,
+    n_x) weighs it. Of another nobody can say that it is closed: a gap that is larger
+    than what is left of the force needs explains the step as well."""
+    contact = pushes(found.lcs)[2]
+    each = contact == np.unique(contact)[:, None]
+    size = np.linalg.norm((each * found.lam) @ (root @ found.lcs.D).T, axis=1)
+    return (each & (size > BEYOND_NOISE)[:, None]).any(axis=0)
+
+
 def gradient_and_information(
     found: Explained, sample: Sample, loss: Loss, dx, dw, one_sided=False
 ):
@@ -232,7 +242,7 @@ def gradient_and_information(
     error = loss.W @ (step_of(lcs, sample, loss)[0] + lcs.D @ found.lam)
     gradient = dx.T @ error + dw.T @ found.force / loss.eps
     root, stiff = root_of(loss.W), 1.0 / np.sqrt(loss.eps * loss.gamma)
-    closed, free = found.eta == 0.0, found.lam > 0.0
+    closed, free = (found.eta == 0.0) & felt(found, root), found.lam > 0.0
     of_z = np.vstack([root @ dx, stiff * dw[closed]])
     of_lam = np.vstack([root @ lcs.D[:, free], stiff * lcs.F[np.ix_(closed, free)]])
     if free.any():
