@@ -12,6 +12,7 @@ from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.data.robot import Log, propose_scene, read_robot
 from makebreak.gap.data.table import RecordingTable
 from makebreak.gap.residuals.contact_problem import ContactProblem
+from makebreak.gap.workflow import run_gap
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import read_scene
@@ -266,3 +267,12 @@ def test_friction_of_a_pair_is_mujocos(tmp_path):
     for pair, friction in (("w.floor", 1.0), ("w.pusher", 0.4)):
         now = dynamics.now("contact_friction", [f"w.crate~{pair}"])
         assert now["friction"] == pytest.approx(friction)
+
+
+def test_a_right_model_of_contacts_that_creep_has_no_gap(tmp_path):
+    """And it is said. Taken for sliding, what creeps is a gap; simulated windows expect
+    what creeping makes of a push at a corner."""
+    pushed(tmp_path, 0.9)
+    result = run_gap(tmp_path / "scene.yaml", [tmp_path / "log.npz"])
+    assert result.verdict == "no_gap", result.says
+    assert "contacts_creep" in {check.kind for check in result.checks}

@@ -108,6 +108,8 @@ class ContactProblem(ContactCandidates, GapProblem):
         these. slides: slower slip [m/s] may be sticking.
         """
         self.slides = slides if learned is None else learned.slides
+        if self.slides > SLIDES:  # Of contacts that creep laws are less exact.
+            self.plan = replace(self.plan, least_error=AGREEMENT_RMS_MAX)
         self._scalable: dict[str, bool] = {}
         # By how much bodies' poses were moved earlier before this (late_poses.py) [s],
         # and the error before and with that.
