@@ -43,6 +43,7 @@ def in_plain_units(gap: GapMeasure) -> str:
     known = {
         name: each for name, each in gap.in_units.items()
         if isfinite(each.expected + each.before) and name in gap.per_channel
+        and each.unit != "1"  # A quaternion's part tells a reader nothing.
     }  # fmt: skip
     if not known:
         return ""

@@ -20,7 +20,9 @@ from makebreak.gap.data.base_pose import BasePose, base_pose, listed_pose
 from makebreak.gap.data.content import (
     CLEARER,
     EXPLAINS,
+    FROM_A_START,
     NOTHING,
+    UNEXPLAINED,
     WITHOUT_WEIGHT,
     Contents,
     Said,
@@ -454,7 +456,12 @@ def judge_logs(robot: Robot, logs: Sequence[Log]) -> Judged:
             robot.plant, robot.joints, log.table.columns, every[log.path]
         )
         every[log.path] = matches
-        said += [each for each in more if each not in said]
+        # What objects push back with is in the efforts, and not in the model's motion.
+        said += [
+            each for each in more
+            if each not in said
+            and not (robot.free and each.kind in (FROM_A_START, UNEXPLAINED))
+        ]  # fmt: skip
     servos = _servos_of_efforts(robot, every, logs)
     most: dict[str, float] = {}
     for name, y in (x for log in logs for x in _scaled(log, every[log.path]).items()):
