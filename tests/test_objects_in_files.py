@@ -285,3 +285,20 @@ def test_a_right_model_of_contacts_that_creep_has_no_gap(tmp_path):
     result = run_gap(tmp_path / "scene.yaml", [tmp_path / "log.npz"])
     assert result.verdict == "no_gap", result.says
     assert "contacts_creep" in {check.kind for check in result.checks}
+
+
+def test_what_hangs_nobody_knows_where_touches_nothing(tmp_path):
+    """A leg on a base without a pose in the log, which the file has near the ground."""
+    leg = (
+        '<body name="trunk" pos="0 0 .1"><freejoint/><geom type="box" size=".1 .1 .02" '
+        'mass="3"/><body name="foot"><joint name="lift" type="slide" axis="0 0 1"/>'
+        '<geom type="sphere" size=".02" mass=".5" pos="0 0 -.1"/></body></body>'
+    )
+    columns = {"time": T, "lift_pos": swing(0), "lift_torque": 3.0 * swing(1)}
+    scene, _, found = proposed(tmp_path, mjcf(leg), columns)
+    assert "ignored_collision_filter_groups: [overlap_0]" in scene
+    assert any(each.kind == "parts_overlap" for each in found.said)
+    pose_of_trunk = {f"trunk_{part}": y for part, y in zip(
+        PARTS, np.tile([0, 0, 0.1, 1, 0, 0, 0], (N, 1)).T, strict=True)}  # fmt: skip
+    scene, _, _ = proposed(tmp_path, mjcf(leg), columns | pose_of_trunk)
+    assert "overlap" not in scene

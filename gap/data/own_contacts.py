@@ -6,10 +6,12 @@ bodies, as a finger and a door are, or a tool and the ground, may touch.
 """
 
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.models.effects.kind import full_name, one_dof_joints
@@ -20,12 +22,14 @@ TOUCHES = 1e-3  # [m] Parts that press on each other are no deeper.
 
 
 def overlapping(
-    scene: str, copies: Mapping[str, str], positions: Iterable[Mapping[str, np.ndarray]]
-) -> list[tuple[str, str]]:
+    scene: str, copies: Mapping[str, str],
+    positions: Iterable[Mapping[str, np.ndarray]], guessed: Collection[str] = (),
+) -> list[tuple[str, str]]:  # fmt: skip
     """(one, other) `<model>::<body>` of each pair of bodies that lie in each other.
 
     Args: scene: a scene's file; copies: {name: text} of files beside it; positions: of
-        each log {joint: (n,)} [rad], [m].
+        each log {joint: (n,)} [rad], [m]; guessed: bodies that are where nobody knows,
+        so that what they carry touches nothing.
     """
     builder = DiagramBuilder()
     with tempfile.TemporaryDirectory() as folder:
@@ -39,6 +43,7 @@ def overlapping(
     root = diagram.CreateDefaultContext()
     context = plant.GetMyContextFromRoot(root)
     found: dict[tuple[str, str], None] = {}
+    root = _roots(plant)
     for log in positions:
         joints = [j for j in one_dof_joints(plant)
                   if j.num_positions() and full_name(plant, j) in log]  # fmt: skip
@@ -56,20 +61,24 @@ def overlapping(
                 if pair.depth > TOUCHES:
                     frames = (inspector.GetFrameId(g) for g in (pair.id_A, pair.id_B))
                     bodies = [plant.GetBodyFromFrameId(frame) for frame in frames]
-                    if len({_root(plant, b) for b in bodies}) > 1:
+                    roots = {root[int(body.index())] for body in bodies}
+                    if len(roots) > 1 and roots.isdisjoint(guessed):
                         continue  # What does not hang together may touch.
                     one, other = sorted(b.scoped_name().get_full() for b in bodies)
                     found[one, other] = None
     return list(found)
 
 
-def _root(plant, body) -> int:
-    """The body on the world, or floating, that carries another; the world's own."""
+def _roots(plant: MultibodyPlant) -> dict[int, str]:
+    """{body: the name of the one on the world, or floating, that carries it}."""
     carried_by = {
         int(j.child_body().index()): int(j.parent_body().index())
         for j in map(plant.get_joint, plant.GetJointIndices())
     }
-    at, world = int(body.index()), int(plant.world_body().index())
-    while carried_by.get(at, world) != world:
-        at = carried_by[at]
-    return at
+    world, found = int(plant.world_body().index()), {}
+    for body in range(plant.num_bodies()):
+        at = body
+        while carried_by.get(at, world) != world:
+            at = carried_by[at]
+        found[body] = plant.get_body(BodyIndex(at)).name()
+    return found

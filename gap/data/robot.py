@@ -692,7 +692,7 @@ def propose_scene(robot: Robot, logs: Sequence[Log]) -> Proposal:
         {name.rpartition(".")[0]: y for name, y in _scaled(log, every[log.path]).items()
          if name.endswith(".position")}
         for log in logs
-    ])  # fmt: skip
+    ], [base for base in robot.bases if base not in robot.poses])  # fmt: skip
     if apart:
         groups = [
             f"- add_collision_filter_group: {{name: overlap_{k}, members: "
