@@ -141,6 +141,13 @@ def _pose(logs, names: Sequence[str], kind: str, place: Sequence[str]) -> BasePo
     )  # fmt: skip
 
 
+def are_quaternion(four: Sequence[np.ndarray]) -> bool:
+    """Whether four columns (n,) are of unit length."""
+    size = np.linalg.norm(four, axis=0)
+    size = size[np.isfinite(size)]
+    return bool(len(size)) and bool(np.quantile(np.abs(size - 1.0), 0.95) < 0.02)
+
+
 def _metres(name: str) -> float:
     unit = _UNIT.search(name.lower())
     return {"mm": 1e-3, "cm": 1e-2}.get(unit[1], 1.0) if unit else 1.0
@@ -159,9 +166,7 @@ def _orientations(
         for keys in (("w", "x", "y", "z"), *_counted(4)):
             own = tuple(parts[k] for k in keys if k in parts)
             if len(own) == 4 and (said or rank < 2 or keys[0] == "w"):
-                size = np.linalg.norm([columns[n] for n in own], axis=0)
-                size = size[np.isfinite(size)]
-                if len(size) and np.quantile(np.abs(size - 1.0), 0.95) < 0.02:
+                if are_quaternion([columns[n] for n in own]):
                     kind = "quaternion" if keys[0] == "w" else "four"
                     found.append((rank, 0, own, kind))
                 break

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from makebreak.gap.data.arrays import words_of
+from makebreak.gap.data.base_pose import are_quaternion
 from makebreak.gap.data.match import Match
 
 _VELOCITIES = {7: 6, 4: 3, 1: 1}  # Of a free body, a ball joint, a joint.
@@ -80,9 +81,9 @@ def _positions(order, columns: Sequence[np.ndarray]) -> list[str | None]:
             told.append(f"{name}.position")
         elif n == 4:
             told += [None] * 4
-        elif _is_unit(seven[3:]):
+        elif are_quaternion(seven[3:]):
             told += [f"{name}.{part}" for part in ("x", "y", "z", *_order(seven[3:]))]
-        elif _is_unit(seven[:4]):
+        elif are_quaternion(seven[:4]):
             told += [f"{name}.{part}" for part in (*_order(seven[:4]), "x", "y", "z")]
         else:
             return []
@@ -95,12 +96,6 @@ def _velocities(order) -> list[str | None]:
     return [
         f"{name}.velocity" if n == 1 else None for name, n in each for _ in range(n)
     ]
-
-
-def _is_unit(four: Sequence[np.ndarray]) -> bool:
-    size = np.sqrt(sum(y**2 for y in four))
-    size = size[np.isfinite(size)]
-    return bool(len(size)) and bool(np.quantile(np.abs(size - 1.0), 0.95) < 0.02)
 
 
 def _order(four: Sequence[np.ndarray]) -> tuple[str, ...]:

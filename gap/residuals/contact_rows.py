@@ -64,12 +64,12 @@ class ContactRows(FeltWalls):
         joint that nothing drives, of which the size of all its terms is free: half of
         an inertia is no better than twice the damping for being less.
         """
-        own = self._left_by(one), self._left_by(other)
         if _gains(one) != _gains(other):
-            return [own]
+            return [(self._left_by(one), self._left_by(other))]
         passive = [i for j, (_, i) in self.joints.items() if self.by[j] == "passive"]
         free = np.isin(self.channel_of_rows(), passive)
         both = [[self._left_by(each, w) for each in (one, other)] for w in (one, other)]
+        own = both[0][0], both[1][1]
         return [
             tuple(np.where(free, x, y) for x, y in zip(own, each, strict=True))
             for each in both
