@@ -13,6 +13,7 @@ from makebreak.gap.simulation.commands import Commands
 from makebreak.gap.simulation.scene_simulation import SceneSimulation
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect
+from makebreak.models.effects.signature import Motion
 from makebreak.models.scene import load_scene
 
 TIMES = np.linspace(0.0, 1.0, 21)
@@ -290,3 +291,16 @@ def test_a_spring_pulls(tmp_path):
     for stiffness, sane in ((0.2, True), (-0.2, False)):
         effect = Effect("joint_spring", ["p.j1"], {"stiffness": stiffness, "rest": 0.1})
         assert candidate.is_sane([effect]) == sane
+
+
+def test_of_dry_friction_acts_what_a_motion_says(tmp_path):
+    """Of a joint that friction holds: any share of it, whatever its smoothed speed."""
+    plain = pendulum(tmp_path)
+    scene = with_effects(plain, ("joint_coulomb_friction", "p.j1", dict(coulomb=0.4)))
+    rng = np.random.default_rng(2)
+    time, (q, v, vd, effort) = np.arange(5.0), rng.normal(size=(4, 5, 1))
+    share = np.array([[-1.0], [-0.3], [0.0], [0.5], [1.0]])
+    motion = Motion(time, q, v, vd, effort)
+    left = SceneDynamics(scene).residual(replace(motion, dry=share))
+    expected = SceneDynamics(plain).residual(motion) - 0.4 * share
+    np.testing.assert_allclose(left, expected, atol=1e-12)

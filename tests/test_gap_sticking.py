@@ -440,6 +440,19 @@ def test_a_joint_at_rest_may_be_held_by_any_friction(tmp_path, stops_sec):
         )
 
 
+def test_what_is_left_at_rest_may_be_friction_where_no_law_says_what_holds(
+    tmp_path, monkeypatch
+):
+    """All rows at rest, each with 10 kN m that nothing explains."""
+    problem = equations_of(tmp_path, "two", [])
+    at_rest, in_units = problem.at_rest, problem.in_units
+    monkeypatch.setattr(problem, "at_rest", lambda *a: np.ones_like(at_rest(*a)))
+    monkeypatch.setattr(problem, "in_units", lambda r: np.full_like(in_units(r), 1e4))
+    held, by_law = (problem._with_friction(x)[1] for x in (0.0, max(STOPS_SEC)))
+    np.testing.assert_allclose(held, 1e4)
+    assert by_law.max() < 1e3
+
+
 def test_all_that_joints_may_have_is_no_arm_without_a_drive(tmp_path):
     """Columns of a rich model must not cancel a drive's own law: neither its gain, nor
     no load with no gain, leaves nothing."""
