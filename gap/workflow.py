@@ -26,7 +26,7 @@ from makebreak.gap.by_recording import (
     with_differences,
 )
 from makebreak.gap.confirm import acts_on_channel, confirmed, judge_of
-from makebreak.gap.data import sampled_commands
+from makebreak.gap.data import effort_loops, sampled_commands
 from makebreak.gap.data.channel_noise import in_newton_metres
 from makebreak.gap.data.check_drives import (
     check_couplings,
@@ -39,6 +39,7 @@ from makebreak.gap.data.checks import check_recordings
 from makebreak.gap.data.command_clock import moved_sooner
 from makebreak.gap.data.conditioning import condition
 from makebreak.gap.data.content import check_contents
+from makebreak.gap.data.effort_loops import OF_LOOP, SHARES, of_loops
 from makebreak.gap.data.findings import Finding
 from makebreak.gap.data.pieces import excerpt
 from makebreak.gap.data.reading import check_against_scene, read_recordings
@@ -103,6 +104,7 @@ from makebreak.gap.simulation.windows import WindowModel, with_step
 from makebreak.gap.thresholds import (
     AGREEMENT_RMS_MAX,
     CLOSED_SHARE_MIN,
+    SAME_EVIDENCE,
 )
 from makebreak.gap.verdict import (
     Facts,
@@ -206,7 +208,7 @@ def _run(
     for recording in recordings:
         check_against_scene(recording, joints, bodies)
         check_drives(recording, scene)
-    recordings = as_used(recordings, dynamics)
+    recordings = of_loops(as_used(recordings, dynamics))
     check_initial_names(scene, recordings)
     check_couplings(scene, dynamics.plant)
     check_meshes(dynamics.loaded, recordings)
@@ -228,6 +230,10 @@ def _run(
     )
     seconds["checks"] = clock.lap()
     limbs = limbs_of(dynamics, parts.decided) if is_mechanism and not meets else []
+    if limbs:
+        say("asking when measured efforts act")
+        parts, found = _with_efforts_of_loops(scene, parts, limbs, jobs)
+        checks += found
     if len(limbs) < 2:
         result = _compared(scene, dynamics, parts, meets, checks, jobs, say, clock)
         return replace(result, seconds={**seconds, **result.seconds})
@@ -405,6 +411,40 @@ def _conditioned(
     reported = with_noise_of(reported, decided)
     decided, cut = _shortened(decided, dynamics)
     return decided, reported, [*done, *cut]
+
+
+def _with_efforts_of_loops(
+    scene: Scene, parts: Split, limbs: Sequence[Sequence[str]], jobs: int
+) -> tuple[Split, list[Finding]]:
+    """The recordings with measured efforts that act between their rows as their loops
+    had them, and what was found: one number for all limbs, where the few effects that
+    explain their motion cost less with it beyond doubt."""
+    every = [c for r in parts.decided for c in r.channels.values()]
+    if not any(c.noise_from == OF_LOOP for c in every):
+        return parts, []
+    ways = [partial(of_loops, share=share) for share in SHARES]
+
+    def gained(limb: Sequence[str]) -> np.ndarray:
+        mine = only(limb, scene, parts) if len(limbs) > 1 else (scene, parts)
+        own, its = without_shapes(mine[0]), mine[1]
+        dynamics = SceneDynamics(own)
+        decided, *others = (
+            _conditioned(replace(its, decided=some), dynamics, True)[0]
+            for some in (its.decided, *(way(its.decided) for way in ways))
+        )
+        try:
+            return MechanismProblem(own, decided).gained_by_efforts(others)
+        except DoesNotFit:  # It is too short.
+            return np.zeros(len(ways))
+
+    each = side_by_side([partial(gained, limb) for limb in limbs], jobs)
+    total = np.sum(list(each), axis=0)
+    k = int(np.argmax(total))
+    if not total[k] > SAME_EVIDENCE:
+        return parts, []
+    decided, reported = (ways[k](some) for some in (parts.decided, parts.reported))
+    said = effort_loops.finding(parts.decided, SHARES[k])
+    return replace(parts, decided=decided, reported=reported), [said]
 
 
 def _commands_of(problem: GapProblem):

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from makebreak.gap.data.effort_loops import OF_LOOP
 from makebreak.gap.data.recording import Channel, Episode, Recording
 from makebreak.gap.numerics.signal_noise import estimate_noise
 from makebreak.models.effects.measured_channels import torque_constant
@@ -59,7 +60,9 @@ def noise_told(
     breaks = np.cumsum([len(i) for i in rows])[:-1]
     own = estimate_noise(channel.values[every], breaks, time[every])
     std, source, given = own.std, "estimated", channel.noise_given
-    if channel.averaged > 1.0:
+    if channel.noise_from == OF_LOOP:  # In its differences are its loop's, too.
+        std, source = given / np.sqrt(channel.averaged), OF_LOOP
+    elif channel.averaged > 1.0:
         # A mean of many may hold noise that goes together over them.
         std = max(own.std, given / np.sqrt(channel.averaged))
     elif given > 0.0:

@@ -15,6 +15,7 @@ import numpy as np
 from makebreak.gap.data.channel_noise import with_noise
 from makebreak.gap.data.clock import clock_period, even_clock
 from makebreak.gap.data.command_clock import changes, on_command_clock
+from makebreak.gap.data.effort_loops import OF_LOOP
 from makebreak.gap.data.filters import FILTERED_SEC
 from makebreak.gap.data.findings import Finding
 from makebreak.gap.data.recording import Channel, Episode, Recording, unit_of
@@ -371,7 +372,8 @@ def _with_jitter(recording: Recording) -> tuple[Recording, list[Finding]]:
     for channel in recording.measured():
         values, stamps, breaks = _samples(recording, channel, recording.time)
         # A coarse grid shows its steps where a channel moves, and none at rest.
-        if len(values) < 200 or channel.step / np.sqrt(12.0) > 0.5 * channel.noise:
+        coarse = channel.step / np.sqrt(12.0) > 0.5 * channel.noise
+        if len(values) < 200 or coarse or channel.noise_from == OF_LOOP:
             continue
         jitter, total = noise_and_jitter(values, breaks, stamps, channel.noise)
         if total > 1.2 * channel.noise:

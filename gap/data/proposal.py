@@ -147,13 +147,15 @@ def of_one_drive(
 ) -> list[Match]:
     """With one kind of command alone: efforts before positions, and before velocities;
     measured efforts stand in for commands of effort. of_servos: channels of measured
-    efforts that are what the position commands' servos give."""
+    efforts that are what the position commands' servos give; others drive nothing."""
     why = "what its position servo gives, and so no other drive"
     matches = [Match(m.column, None, why=why) if m.channel in of_servos else m
                for m in matches]  # fmt: skip
     kinds = {
         m.channel.rsplit(".", 1)[1] for m in matches if m.channel and "." in m.channel
     }
+    if of_servos:
+        kinds.discard("effort_measured")
     keep = next((k for k in ("effort_command", "effort_measured", "position_command",
                              "velocity_command") if k in kinds), None)  # fmt: skip
     out = []

@@ -87,6 +87,7 @@ GAINS_KNOWN_TO = 0.05  # Of those that motion tells; the masses alone are off by
 LEAST_ROTOR = 0.05  # Of what a joint moves: less is left out of a proposal.
 DRIVEN_SHARE = 0.5  # Of its weight and motion, the effort that a driven joint needs.
 BEYOND = 1.05  # Of a drive's limit: more than noise of an effort at it.
+FEW = 0.25  # Of all joints: so many may have other gains than their file has.
 LEAST_LOAD = 0.05  # Of a joint's rms gravity torque [N m], to tell its servo by.
 
 
@@ -462,7 +463,7 @@ def judge_logs(robot: Robot, logs: Sequence[Log]) -> Judged:
             if each not in said
             and not (robot.free and each.kind in (FROM_A_START, UNEXPLAINED))
         ]  # fmt: skip
-    servos = _servos_of_efforts(robot, every, logs)
+    servos = _servos_of_efforts(robot, every, logs, said)
     most: dict[str, float] = {}
     for name, y in (x for log in logs for x in _scaled(log, every[log.path]).items()):
         joint, _, what = name.rpartition(".")
@@ -474,9 +475,13 @@ def judge_logs(robot: Robot, logs: Sequence[Log]) -> Judged:
     return Judged(robot, every, fixed, tuple(unused), tuple(said), servos, most)
 
 
-def _servos_of_efforts(robot: Robot, every, logs) -> dict[str, ServoGains]:
+def _servos_of_efforts(
+    robot: Robot, every, logs, said: list[Said]
+) -> dict[str, ServoGains]:
     """{joint: gains} where all measured efforts are what position servos give: these
-    tell what acts between the rows, too, where a step of a command has its effect."""
+    tell what acts between the rows, too, where a step of a command has its effect. Of
+    few joints whose efforts are a multiple of what the file's gains give, which all
+    others have, that is said: a drive that is weaker shows in the motion, too."""
     motions, drives = _motions(robot, every, logs), robot.file.drives
     if not motions:
         return {}
@@ -485,8 +490,27 @@ def _servos_of_efforts(robot: Robot, every, logs) -> dict[str, ServoGains]:
         (own.kp, own.kd) if own is not None and own.kp else None for own in of_file
     ]
     found = gains_of_efforts(motions, known)
-    return {joint.name: own for joint, own in zip(robot.joints, found, strict=True)
-            if own is not None} if None not in found else {}  # fmt: skip
+    out = {joint.name: own for joint, own in zip(robot.joints, found, strict=True)
+           if own is not None}  # fmt: skip
+    if len(out) < len(found):
+        return {}
+    other = {
+        name: gains for (name, own), gains in zip(out.items(), known, strict=True)
+        if gains is not None and own.kp != gains[0]
+    }  # fmt: skip
+    if None in known or len(other) > FEW * len(out):
+        return out
+    for name, gains in other.items():
+        times = out[name].kp / gains[0]
+        says = (
+            f"{name}: measured efforts are {times:.2g} times what the servo of "
+            f"{robot.path.name} gives, those of the other joints just that: they are "
+            "taken for measured wrongly (a torque constant), and are not used; the "
+            "motion tells whether the drive is weaker (servo_gain)"
+        )
+        said.append(Said("effort_of_other_gains", name, times, says))
+        out[name] = ServoGains(*gains, 0.0, 0.0)
+    return out
 
 
 def _numbered(robot: Robot, logs: Sequence[Log], said: list[Said]) -> Robot:
@@ -913,7 +937,8 @@ def _actuation(judged: Judged, kinds, logs, notes: list[str]) -> tuple[list[str]
         return [j.name for j in robot.joints if j.name in kinds.get(what, ())]
 
     for what in ("effort_command", "effort_measured"):
-        if joints := named(what):
+        joints = [] if servos else named(what)
+        if joints:
             notes.append(f"the joints are driven by the recorded {what}")
             untold, passive = _untold(robot, every, logs, joints)
             if passive:

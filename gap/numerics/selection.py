@@ -201,6 +201,14 @@ def in_place_of_others(columns, r, scale: float) -> tuple[np.ndarray, float]:
     return c, 0.0 if more else without - with_it
 
 
+def cost_of_few(columns, r, scale: float) -> float:
+    """Of what the few columns (m, k) that explain r (m,) leave, and of these.
+
+    Args: scale: of what is left of a row.
+    """
+    return _few(np.column_stack([np.zeros(len(r)), columns]), r, scale)[1]
+
+
 def _few(columns, r, scale: float) -> tuple[np.ndarray, float]:
     """The coefficients (k,) of the few columns (m, k) that explain r (m,), 0 for the
     others, and their cost: one after another, the most telling first, while each gains

@@ -10,7 +10,12 @@ from scipy.optimize import minimize_scalar
 from makebreak.gap.data.findings import Finding
 from makebreak.gap.data.recording import Recording
 from makebreak.gap.does_not_fit import DoesNotFit
-from makebreak.gap.numerics.selection import Screen, in_place_of_others, is_predicted
+from makebreak.gap.numerics.selection import (
+    Screen,
+    cost_of_few,
+    in_place_of_others,
+    is_predicted,
+)
 from makebreak.gap.problem import (
     Candidate,
     Fitted,
@@ -464,10 +469,7 @@ class MechanismProblem(InverseModel, GapProblem):
         given = [j for j, law, has in told if law is not None and has]
         if not given:
             return 0.0
-        kind, n, row = self._delay_kind(), self.nuisances(), self.row_sec()
-        if self._found is None:
-            self._found = candidates(self, n, self._settled(self.base()))
-        lacks, train = rich_columns(self, self._of_joints())[0], self.train()
+        kind, row = self._delay_kind(), self.row_sec()
 
         def left_by(seconds: float) -> np.ndarray:
             late = Effect(kind, given, {"delay": -seconds})
@@ -475,25 +477,14 @@ class MechanismProblem(InverseModel, GapProblem):
 
         early = (self.base() - left_by(row)) / row
         by_drives, by_bearings = self.late_velocities()
-        rich = np.column_stack([early, by_drives, by_bearings, lacks])
-        left = Screen(self.base(), n.columns, n.prior, train, reach=n.reach).fit(rich)
-        scale = max(left.train, 1.0) * self.correlation
-        # With nuisances' own costs as rows, all is one least-squares problem.
-        free = np.vstack([n.columns[train], np.diag(scale / n.prior)])
-        Q = np.linalg.qr(free)[0]
-
-        def beside(x: np.ndarray) -> np.ndarray:
-            """Of columns (m, k), or one (m,), what no nuisance can be."""
-            x = np.concatenate([x[train], np.zeros((len(n.prior), *x.shape[1:]))])
-            return x - Q @ (Q.T @ x)
-
-        r, others = beside(self.base()), beside(lacks)
+        columns = np.column_stack([early, by_drives, by_bearings])
+        beside, others, scale = self._beside_nuisances(columns)
         # The same steps have velocities that drives, and that bearings, act on late, or
         # early if they are implicit in them.
-        loops = [
+        r, loops = beside(self.base()), [
             beside(drives * by_drives + bearings * by_bearings)
             for drives, bearings in ((0, 0), (1, 1), (1, -1), (-1, -1))
-        ]
+        ]  # fmt: skip
         found = [
             in_place_of_others(np.column_stack([beside(early) + x, others]), r, scale)
             for x in loops
@@ -511,6 +502,56 @@ class MechanismProblem(InverseModel, GapProblem):
 
         around = (0.5 * first, min(1.5 * first, LAST * row))
         return float(minimize_scalar(cost, bounds=around, method="bounded").x)
+
+    def _less_by_efforts(self, other: Sequence[Recording]) -> np.ndarray:
+        """(m,) what it takes off the residual that measured efforts which stand in for
+        commands are those of other recordings, of the same rows."""
+        by_name, parts = {r.name: r for r in other}, []
+        for track in self.tracks:
+            its = by_name[track.recording]
+            rows = next(e.rows for e in its.episodes if e.number == track.episode
+                        and its.time[e.first] == track.time[0])  # fmt: skip
+            less = np.zeros((len(track.middle), len(self.joints), 1))
+            for i, joint in enumerate(self.joints):
+                name = f"{joint}.effort_measured"
+                if self.by_measured[i]:
+                    y = track.samples[name] - its[name][rows]
+                    good = np.isfinite(y)
+                    less[:, i, 0] = np.interp(track.middle, track.time[good], y[good])
+            parts.append(less)
+        return self.columns_of(parts)[:, 0]
+
+    def gained_by_efforts(self, others: Sequence[Sequence[Recording]]) -> np.ndarray:
+        """(n,) by how much less the few effects cost that explain the motion with the
+        efforts of each of n recordings, of the same rows."""
+        each = np.stack([self._less_by_efforts(other) for other in others], axis=1)
+        beside, lacks, scale = self._beside_nuisances(each)
+        r = beside(self.base())
+        before = cost_of_few(lacks, r, scale)
+        return np.array(
+            [before - cost_of_few(lacks, r - x, scale) for x in beside(each).T]
+        )
+
+    def _beside_nuisances(self, more: np.ndarray):
+        """What gives of columns (m, k), or one (m,), the fitted part that no nuisance
+        can be; those parts of all that joints may lack; and what is left of a row with
+        these and `more` (m, k)."""
+        n, train = self.nuisances(), self.train()
+        if self._found is None:
+            self._found = candidates(self, n, self._settled(self.base()))
+        lacks = rich_columns(self, self._of_joints())[0]
+        rich = np.hstack([more, lacks])
+        left = Screen(self.base(), n.columns, n.prior, train, reach=n.reach).fit(rich)
+        scale = max(left.train, 1.0) * self.correlation
+        # With nuisances' own costs as rows, all is one least-squares problem.
+        free = np.vstack([n.columns[train], np.diag(scale / n.prior)])
+        Q = np.linalg.qr(free)[0]
+
+        def beside(x: np.ndarray) -> np.ndarray:
+            x = np.concatenate([x[train], np.zeros((len(n.prior), *x.shape[1:]))])
+            return x - Q @ (Q.T @ x)
+
+        return beside, beside(lacks), scale
 
     def _of_joints(self) -> list[Candidate]:
         """Of what is found all that is no matter of channels and commands."""
@@ -857,11 +898,15 @@ class MechanismProblem(InverseModel, GapProblem):
         def measured_with(
             noise: dict[str, float],
         ) -> tuple[GapMeasure, list[Series], list[Where]] | None:
-            return measure(
-                scene, effects, moved, model, model is not self, jobs,
+            rest = (
+                effects, moved, model, model is not self, jobs,
                 self._is_pushed if model is self else lambda window: False, noise,
                 known,
             )  # fmt: skip
+            try:
+                return measure(scene, *rest)
+            except ValueError:  # A drive that its nuisances would make too stiff.
+                return measure(self.scene, *rest)
 
         measured = measured_with(slow)
         if measured is None:  # In every window something pushes.
