@@ -10,7 +10,7 @@ from test_driven_arm import tree
 from makebreak.gap.data.command_clock import moved_sooner
 from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.problem import Candidate
-from makebreak.gap.residuals import mechanism_measure
+from makebreak.gap.residuals import mechanism, mechanism_measure
 from makebreak.gap.residuals.driven import DrivenProblem, is_driven
 from makebreak.gap.residuals.mechanism import (
     STOPS_SEC,
@@ -438,6 +438,28 @@ def test_a_joint_at_rest_may_be_held_by_any_friction(tmp_path, stops_sec):
         assert found[tuple(at)].parameters["coulomb"] == pytest.approx(
             p["coulomb"], rel=0.01
         )
+
+
+def test_a_drive_that_its_tolerance_makes_too_stiff_is_judged_as_it_came(
+    tmp_path, monkeypatch
+):
+    """A G1's wrist without its rotor: 0.81 N m s/rad on 2e-4 kg m2, which can just be
+    simulated, ended all of it with an error, with a hundredth more."""
+    problem = equations_of(tmp_path, "two", [])
+    n = problem.nuisances()
+    selection = select(problem)
+    came, judged = problem.scene, []
+
+    def measure(scene, *rest):
+        judged.append(scene)
+        if scene is not came:
+            raise ValueError("too little for that to be simulated")
+        return None
+
+    monkeypatch.setattr(mechanism, "measure", measure)
+    monkeypatch.setattr(mechanism, "with_moved_gains", lambda scene, *_: replace(scene))
+    outcome = problem.outcome([], selection.start, selection.start, n)
+    assert outcome is None and judged[-1] is came and len(judged) == 2
 
 
 def test_what_is_left_at_rest_may_be_friction_where_no_law_says_what_holds(

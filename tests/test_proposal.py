@@ -691,6 +691,48 @@ def test_efforts_that_are_what_a_servo_gives_tell_its_gains(tmp_path, own):
     assert '"j_effort": null' in sidecar or "j_effort: null" in sidecar
 
 
+@pytest.mark.parametrize("wrong", [1, 3])
+def test_efforts_of_one_joint_that_are_a_multiple_of_its_servos_are_said(
+    tmp_path, wrong
+):
+    """Of five wheels; where three have other gains than the file, it is the file."""
+    t = 0.002 * np.arange(6000)
+    bodies, motors, rows = "", "", {"time": t}
+    for k in range(5):
+        bodies += (
+            f'<body name="link{k}" pos="0 {k} 0"><joint name="w{k}" axis="0 1 0" '
+            'range="-2 2"/><inertial pos="0 0 0" mass="1" diaginertia="0.3 0.3 0.3"/>'
+            "</body>"
+        )
+        motors += f'<position joint="w{k}" kp="80" kv="3"/>'
+        goal = 0.5 * np.sin((2.0 + 0.3 * k) * t) + 0.2 * np.sin(5.0 * t + k)
+        told = goal[10 * (np.arange(6000) // 10)]
+        q, v, effort, x, rate = *np.zeros((3, 6000)), told[0], 0.0
+        for i in range(6000):
+            q[i], v[i], effort[i] = x, rate, 80.0 * (told[i] - x) - 3.0 * rate
+            rate += 0.002 * effort[i] / 0.3
+            x += 0.002 * rate
+        rows |= {f"w{k}_pos": q, f"w{k}_vel": v, f"w{k}_cmd_pos": told,
+                 f"w{k}_effort": effort * (0.85 if k < wrong else 1.0)}  # fmt: skip
+    robot, log = tmp_path / "five.xml", tmp_path / "log.csv"
+    robot.write_text(
+        '<mujoco model="five"><compiler angle="radian"/><worldbody>'
+        f"{bodies}</worldbody><actuator>{motors}</actuator></mujoco>"
+    )
+    np.savetxt(log, np.stack([*rows.values()], 1), delimiter=",",
+               header=",".join(rows), comments="")  # fmt: skip
+    proposal = propose_scene(read_robot(robot), [read_log(log)])
+    (tmp_path / "scene.yaml").write_text(proposal.scene)
+    kp = read_scene(tmp_path / "scene.yaml").actuation.kp
+    said = [s for s in proposal.said if s.kind == "effort_of_other_gains"]
+    if wrong > 1:
+        assert not said and kp == pytest.approx(wrong * [68.0] + [80.0] * 2, rel=0.02)
+        return
+    assert kp == [80.0] * 5
+    assert [s.channel for s in said] == ["five.w0"]
+    assert said[0].size == pytest.approx(0.85, rel=0.01)
+
+
 @pytest.mark.parametrize("kp, told", [(80.8, 80.0), (88.0, 88.0)])
 def test_gains_of_the_file_are_taken_where_parts_of_a_law_nearly_cancel(kp, told):
     """A light joint needs next to nothing of the tens of N m that stiffness and damping
