@@ -36,6 +36,7 @@ from makebreak.models.scene import (
 )
 from makebreak.models.scene_schema import as_kind
 from makebreak.systems.arm.impedance_controller import serial_chain_of
+from makebreak.systems.arm.numerics.serial_chain import SerialChain
 from makebreak.systems.arm.tool_wrench import ToolWrench
 from makebreak.systems.faults.fault_forces import BodyForce
 from makebreak.systems.faults.fault_signals import LateSignal
@@ -161,7 +162,7 @@ def make_station(
     _add_encoders(sensing)
     _add_torque_sensor(sensing, limit, command)
     _add_wrench_sensor(sensing, tool)
-    _export_truth(builder, config, loaded)
+    _export_truth(builder, config, loaded, sensing.chain)
     if config.camera is not None:
         image = add_camera(
             builder, loaded.scene_graph, plant, config.camera, sensing.seeds[3]
@@ -222,6 +223,8 @@ class _Sensing:
         self.arm = self.plant.GetModelInstanceByName(ARM)
         self.n = self.plant.num_velocities(self.arm)
         self.period = self.plant.time_step() or 0.001
+        own = make_control_plant(loaded.scene, config.tool)
+        self.chain = serial_chain_of(own, TIP_FRAME)
         # Seeds of encoders, torque, wrench and camera.
         sequence = np.random.SeedSequence(config.seed)
         self.seeds = [int(seed) for seed in sequence.generate_state(4)]
@@ -296,12 +299,15 @@ def _add_wrench_sensor(sensing: _Sensing, tool: RigidBody) -> None:
     )
     period = sensing.period if config.sampled else None
     sensor = builder.AddNamedSystem(
-        f"{ARM}_tool_wrench", ToolWrench(plant, mount.name(), TIP_FRAME, period)
+        f"{ARM}_tool_wrench",
+        ToolWrench(plant, mount.name(), TIP_FRAME, sensing.chain, period),
     )
     builder.Connect(
         plant.get_reaction_forces_output_port(), sensor.GetInputPort("reaction_forces")
     )
-    builder.Connect(plant.get_state_output_port(), sensor.GetInputPort("state"))
+    builder.Connect(
+        plant.get_state_output_port(sensing.arm), sensor.GetInputPort("state")
+    )
     wrench = sensor.GetOutputPort("wrench")
     if np.any(errors.force_bias) or np.any(errors.force_drift):
         no_moment = np.zeros(3)
@@ -322,7 +328,10 @@ def _add_wrench_sensor(sensing: _Sensing, tool: RigidBody) -> None:
 
 
 def _export_truth(
-    builder: DiagramBuilder, config: StationConfig, loaded: LoadedScene
+    builder: DiagramBuilder,
+    config: StationConfig,
+    loaded: LoadedScene,
+    chain: SerialChain,
 ) -> None:
     """The outputs for scoring and tests only."""
     plant = loaded.plant
@@ -335,7 +344,6 @@ def _export_truth(
         plant.get_contact_results_output_port(), probe.GetInputPort("contact_results")
     )
     builder.ExportOutput(probe.GetOutputPort("contact_force"), "contact_force")
-    chain = serial_chain_of(make_control_plant(loaded.scene, config.tool), TIP_FRAME)
     tool_contact = builder.AddNamedSystem("tool_contact", ToolContactForce(chain))
     builder.Connect(
         plant.get_state_output_port(arm), tool_contact.GetInputPort("state")

@@ -17,7 +17,9 @@ from makebreak.models.scene import read_scene
 from makebreak.systems.arm.impedance_controller import (
     ImpedanceConfig,
     ImpedanceController,
+    serial_chain_of,
 )
+from makebreak.systems.arm.numerics.packed import packed
 from makebreak.systems.arm.numerics.tool_wrench import external_wrench
 from makebreak.systems.perception.noisy_sensor import NoisySensor
 from makebreak.systems.perception.numerics.sensor_noise import add_noise
@@ -151,13 +153,21 @@ def test_reading_follows_the_value_and_holds_its_noise_for_a_sample():
 
 
 def test_wrench_arithmetic_is_a_balance_of_moments():
-    # A tool of 2 kg hangs with its mount turned by 90 degrees; pushed at its tip.
-    R = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    # A tool of 2 kg hangs with its mount turned, and its tip turned in it; pushed at
+    # its tip.
+    plant = make_control_plant()
+    q, context = np.linspace(0.2, -1.4, 7), plant.CreateDefaultContext()
+    plant.SetPositions(context, q)
+    R_WE = plant.GetFrameByName("tip").CalcPoseInWorld(context).rotation().matrix()
+    R_CE = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    R = R_WE @ R_CE.T
+    chain = packed(serial_chain_of(plant, "tip"))
     p_CM, p_CE = np.array([0.1, 0, 0]), np.array([0.2, 0.1, 0])
     weight, push = np.array([0, 0, -20.0]), np.array([1.0, 2.0, 3.0])
     f_mount = -(weight + push)
     t_mount = -np.cross(R @ p_CM, weight) - np.cross(R @ p_CE, push)
-    found = external_wrench(R.T @ f_mount, R.T @ t_mount, R, weight, p_CM, p_CE)
+    mount = R.T @ f_mount, R.T @ t_mount
+    found = external_wrench(*mount, q, chain, R_CE, weight, p_CM, p_CE)
     np.testing.assert_allclose(found, [*push, 0, 0, 0], atol=1e-13)
 
 

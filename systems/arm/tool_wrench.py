@@ -6,6 +6,8 @@ from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
+from makebreak.systems.arm.numerics.packed import packed
+from makebreak.systems.arm.numerics.serial_chain import SerialChain
 from makebreak.systems.arm.numerics.tool_wrench import external_wrench
 from makebreak.systems.numerics.first_calls import first_call
 
@@ -16,7 +18,7 @@ class ToolWrench(LeafSystem):
     The tool's inertial force (m a, some 0.1 N for a light finger) is not removed, as on
     a robot without accelerometer.
 
-    Inputs:  reaction_forces (abstract) and state (n_x,) of the plant.
+    Inputs:  reaction_forces (abstract) of the plant, state (2 n,) of its arm.
     Outputs: wrench (6,): on the tool at its tip, in world axes, force first [N], [N m].
 
     Without a period it is computed when evaluated, from the torques and the state of
@@ -25,8 +27,8 @@ class ToolWrench(LeafSystem):
     without a contact solution of its own.
 
     Args: plant: finalized; joint: name of the weld that mounts the tool, with the tool
-        as its child; tip: name of a frame on the tool; period_sec: the plant's time
-        step, or None.
+        as its child; tip: name of a frame on the tool; chain: of the arm in the plant,
+        up to this frame; period_sec: the plant's time step, or None.
     """
 
     def __init__(
@@ -34,32 +36,32 @@ class ToolWrench(LeafSystem):
         plant: MultibodyPlant,
         joint: str,
         tip: str,
+        chain: SerialChain,
         period_sec: float | None = None,
     ):
         super().__init__()
-        self._plant = plant
         mount = plant.GetJointByName(joint)
         self._ordinal = int(mount.index())  # Equal where no joint was removed.
-        self._mount = mount.frame_on_child()
-        self._plant_context = plant.CreateDefaultContext()
-        inertia = mount.child_body().CalcSpatialInertiaInBodyFrame(self._plant_context)
-        self._weight = inertia.get_mass() * np.array(
-            plant.gravity_field().gravity_vector()
+        context = plant.CreateDefaultContext()
+        tool, C = mount.child_body(), mount.frame_on_child()
+        inertia = tool.CalcSpatialInertiaInBodyFrame(context)
+        X_BC = C.CalcPoseInBodyFrame(context)
+        X_CE = plant.CalcRelativeTransform(context, C, plant.GetFrameByName(tip))
+        self._n = len(chain.mass)
+        self._constants = (
+            packed(chain),
+            X_CE.rotation().matrix(),
+            inertia.get_mass() * np.array(plant.gravity_field().gravity_vector()),
+            X_BC.inverse() @ np.array(inertia.get_com()),
+            X_CE.translation(),
         )
-        X_BC = self._mount.CalcPoseInBodyFrame(self._plant_context)
-        self._p_CM = X_BC.inverse() @ np.array(inertia.get_com())
-        self._p_CE = plant.CalcRelativeTransform(
-            self._plant_context, self._mount, plant.GetFrameByName(tip)
-        ).translation()
         zero = np.zeros(3)  # Read-only, as the arrays that Drake gives.
         zero.setflags(write=False)
-        R = self._mount.CalcRotationMatrixInWorld(self._plant_context).matrix()
-        constants = self._weight, self._p_CM, self._p_CE
-        first_call(external_wrench, zero, zero, R, *constants)
+        first_call(external_wrench, zero, zero, np.zeros(self._n), *self._constants)
         self._reactions = self.DeclareAbstractInputPort(
             "reaction_forces", AbstractValue.Make([SpatialForce.Zero()])
         )
-        self._x = self.DeclareVectorInputPort("state", plant.num_multibody_states())
+        self._x = self.DeclareVectorInputPort("state", 2 * self._n)
         if period_sec is None:
             self.DeclareVectorOutputPort("wrench", 6, self._calc)
         else:
@@ -74,15 +76,10 @@ class ToolWrench(LeafSystem):
         discrete_state.set_value(self._sampled, self._wrench(context))
 
     def _wrench(self, context: Context) -> np.ndarray:
-        self._plant.SetPositionsAndVelocities(
-            self._plant_context, self._x.Eval(context)
-        )
         reaction = self._reactions.Eval(context)[self._ordinal]
         return external_wrench(
             reaction.translational(),
             reaction.rotational(),
-            self._mount.CalcRotationMatrixInWorld(self._plant_context).matrix(),
-            self._weight,
-            self._p_CM,
-            self._p_CE,
+            self._x.Eval(context)[: self._n],
+            *self._constants,
         )
