@@ -535,9 +535,15 @@ def _add_touch(builder, config: GentleRollingConfig, ball: BallRollingConfig) ->
     connect("forward_model_bank", "prediction_error", "variable_impedance")
     connect("variable_impedance", "wrench_feedforward", "reference_blend")
     connect("variable_impedance", "stiffness", impedance)
-    connect("arm_reference", "x_desired", ("reference_blend", "planned"),
-            ("push_motion", "arm"))  # fmt: skip
-    connect("arm_reference", "wrench", ("reference_blend", "planned_wrench"))
+    planned = builder.GetSubsystemByName("arm_reference").GetOutputPort("command")
+    parts = split(builder, planned, "planned", dict(x_desired=19, wrench=6))
+    for part, name, own in (
+        ("x_desired", "reference_blend", "planned"),
+        ("x_desired", "push_motion", "arm"),
+        ("wrench", "reference_blend", "planned_wrench"),
+    ):
+        system = builder.GetSubsystemByName(name)
+        builder.Connect(parts[part], system.GetInputPort(own))
     connect("reference_blend", "reference", "arm_reference")
     connect("reference_blend", "direction", "mode_detector", "forward_model_bank")
     connect("reference_blend", "contact_directions",

@@ -271,8 +271,8 @@ class ImpedanceController(LeafSystem):
             measured = self._or(self._measured, context, self._no_wrench)
         tau, status, memory = tick(
             *self._packed,
-            np.array(context.get_discrete_state(self._tau).value()),
-            np.array(context.get_discrete_state(self._memory).value()),
+            discrete_state.get_mutable_value(self._tau),
+            discrete_state.get_mutable_value(self._memory),
             self._q.Eval(context),
             self._v.Eval(context),
             self._x_desired.Eval(context),

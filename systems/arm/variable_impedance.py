@@ -158,7 +158,7 @@ class VariableImpedance(LeafSystem):
             handing_over = self._handing_over.Eval(context)[0]
         memory, output = tick(
             self._law,
-            context.get_discrete_state(self._memory).value(),
+            discrete_state.value(self._memory),
             self._error.Eval(context)[0],
             self._predicted.Eval(context),
             self._collecting.Eval(context)[0],

@@ -1,6 +1,7 @@
 """Tares the force-torque sensor in free space: see numerics/wrench_tare.py."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
@@ -86,51 +87,35 @@ class WrenchTare(LeafSystem):
             period=float(config.period_sec),
         )
         first_call(warm_up, self._law)
-        self._wrench = self.DeclareVectorInputPort("wrench", 6)
+        wrench = self.DeclareVectorInputPort("wrench", 6)
         velocity = self.DeclareVectorInputPort("ee_velocity", 6)
-        self._rows = self.DeclareVectorInputPort("force_directions", 6)
-        self._ports = [self._wrench, velocity, self._rows]
+        rows = self.DeclareVectorInputPort("force_directions", 6)
+        self._ports = [wrench, velocity, rows]
         self._memory = self.DeclareDiscreteState(new_memory())
-        ticket = {self.discrete_state_ticket(self._memory)}
-
-        for name, size, value, inputs in (
-            ("wrench", 6, self._tared, {self._wrench.ticket()}),
-            ("wrench_mean", 6, self._tared_mean, {self._wrench.ticket()}),
-            ("force_directions", 6, self._sloped, {self._rows.ticket()}),
+        memory = self.discrete_state_ticket(self._memory)
+        for name, size, value, *ports in (
+            ("wrench", 6, partial(tared, self._law), wrench),
+            ("wrench_mean", 6, partial(tared_mean, self._law), wrench),
+            ("force_directions", 6, sloped, rows),
+            ("bias", 6, bias_of),
+            ("slope", 3, lambda memory: memory[SLOPE]),
+            ("status", 1, lambda memory: memory[STATUS]),
         ):
-            self.DeclareVectorOutputPort(name, size, value, ticket | inputs)
-        self._told = [
-            (self.DeclareDiscreteState(said(new_memory())), said)
-            for said in (
-                bias_of,
-                lambda memory: memory[SLOPE],
-                lambda memory: memory[STATUS],
-            )
-        ]
-        for name, (state, _) in zip(
-            ("bias", "slope", "status"), self._told, strict=True
-        ):
-            self.DeclareStateOutputPort(name, state)
+            tickets = {memory, *(port.ticket() for port in ports)}
+            self.DeclareVectorOutputPort(name, size, self._calc(value, ports), tickets)
         self.DeclarePeriodicDiscreteUpdateEvent(
             config.period_sec, config.offset_sec, self._update
         )
 
-    def _tared(self, context: Context, output: BasicVector):
-        memory = context.get_discrete_state(self._memory).value()
-        output.SetFromVector(tared(self._law, memory, self._wrench.Eval(context)))
+    def _calc(self, value, ports):
+        def calc(context: Context, output: BasicVector):
+            memory = context.get_discrete_state(self._memory).value()
+            output.SetFromVector(value(memory, *[p.Eval(context) for p in ports]))
 
-    def _tared_mean(self, context: Context, output: BasicVector):
-        memory = context.get_discrete_state(self._memory).value()
-        output.SetFromVector(tared_mean(self._law, memory, self._wrench.Eval(context)))
-
-    def _sloped(self, context: Context, output: BasicVector):
-        memory = context.get_discrete_state(self._memory).value()
-        output.SetFromVector(sloped(memory, self._rows.Eval(context)))
+        return calc
 
     @timed
     def _update(self, context: Context, discrete_state):
-        memory = context.get_discrete_state(self._memory).value()
+        memory = discrete_state.value(self._memory)
         memory = tick(self._law, memory, *[p.Eval(context) for p in self._ports])
         discrete_state.set_value(self._memory, memory)
-        for state, said in self._told:
-            discrete_state.set_value(state, said(memory))

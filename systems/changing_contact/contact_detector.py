@@ -106,8 +106,8 @@ class ContactDetector(LeafSystem):
     def _update(self, context: Context, discrete_state):
         memory, contact = detect(
             self._limits,
-            context.get_discrete_state(self._memory).value(),
-            context.get_discrete_state(self._contact).value(),
+            discrete_state.value(self._memory),
+            discrete_state.value(self._contact),
             context.get_time(),
             *[port.Eval(context) for port in self._ports],
         )

@@ -92,19 +92,19 @@ class ReferenceBlend(LeafSystem):
         }
         self._blend = self.DeclareDiscreteState(N_BLEND)
         self._soft = self.DeclareDiscreteState(N_BLEND)
-        now = {self.discrete_state_ticket(self._blend), self.time_ticket()}
-        soft = {self.discrete_state_ticket(self._soft)}
+        blend = self.discrete_state_ticket(self._blend)
+        soft = self.discrete_state_ticket(self._soft)
+        time = self.time_ticket()
         self._dampings = np.array([config.damping, config.damping_impact], dtype=float)
-        for name, size, calc, reads in (
-            ("x_desired", 19, self._pose, POSE),
-            ("command", sum(COMMAND), self._command, (*POSE, *FORCES)),
-            ("direction", 3, self._direction, POSE),
+        for name, size, calc, reads, *tickets in (
+            ("x_desired", 19, self._pose, POSE, time),
+            ("command", sum(COMMAND), self._command, (*POSE, *FORCES), time, soft),
+            ("direction", 3, self._direction, POSE, time),
             ("contact_directions", 6, self._contacts, ("x", "force_directions")),
-            ("reference", 9, self._reference, (*POSE[1:], "task_reference")),
+            ("reference", 9, self._reference, (*POSE[1:], "task_reference"), time),
         ):
-            tickets = now | {self._in[port].ticket() for port in reads}
-            tickets |= soft if name == "command" else set()
-            self.DeclareVectorOutputPort(name, size, calc, tickets)
+            needs = {blend, *tickets, *(self._in[port].ticket() for port in reads)}
+            self.DeclareVectorOutputPort(name, size, calc, needs)
         self.DeclarePeriodicDiscreteUpdateEvent(
             config.period_sec, config.offset_sec, self._update
         )

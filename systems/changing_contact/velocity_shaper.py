@@ -225,15 +225,15 @@ class VelocityShaper(LeafSystem):
     def _update(self, context: Context, discrete_state):
         t, law = context.get_time(), self._law
         contact, pose = self._contact.Eval(context), self._ee_pose.Eval(context)
-        regions = context.get_discrete_state(self._regions).value()
-        memory = context.get_discrete_state(self._memory).value()
+        regions = discrete_state.value(self._regions)
+        memory = discrete_state.value(self._memory)
         table, old = self._pattern.table, None
         if self._motion.HasValue(context):
             patterns = self._now(context)
             table, old = patterns.now.table, patterns.old
         memory, X, *rest = tick(table, law, regions, memory, t, contact, pose)
         if old is not None and t < patterns.t + patterns.T:
-            before = context.get_discrete_state(self._memory_old).value()
+            before = discrete_state.value(self._memory_old)
             before, X_old, *_ = tick(
                 old.table, law, self._no_regions, before, t, self._no_contact, pose
             )
