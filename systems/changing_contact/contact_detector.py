@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.systems.framework import Context, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from makebreak.systems.changing_contact.numerics.contact_detector import (
     MEMORY,
@@ -46,7 +46,7 @@ class ContactDetector(LeafSystem):
         force_directions (6,) two rows n, pressed along; a zero row: none.
         phase (6,) of the motion, numerics/contact_task.py.
 
-    Outputs, all of them state:
+    Outputs:
         contact (14,) of numerics/contact_task.py: counters of contacts made, broken
             and peaks measured; time, p_WE, direction and speed of the last one made, at
             its first sample; its peak force; status 1 while the wrench is NaN, stuck
@@ -94,13 +94,17 @@ class ContactDetector(LeafSystem):
             )
         ]
         self._contact = self.DeclareDiscreteState(N_CONTACT)
-        self._along = self.DeclareDiscreteState(2)
         self._memory = self.DeclareDiscreteState(new_memory(tared))
         self.DeclareStateOutputPort("contact", self._contact)
-        self.DeclareStateOutputPort("along", self._along)
+        memory = {self.discrete_state_ticket(self._memory)}
+        self.DeclareVectorOutputPort("along", 2, self._along, memory)
         self.DeclarePeriodicDiscreteUpdateEvent(
             config.period_sec, config.offset_sec, self._update
         )
+
+    def _along(self, context: Context, output: BasicVector):
+        memory = context.get_discrete_state(self._memory).value()
+        output.SetFromVector(memory.view(MEMORY)["along"][0])
 
     @timed
     def _update(self, context: Context, discrete_state):
@@ -113,5 +117,3 @@ class ContactDetector(LeafSystem):
         )
         discrete_state.set_value(self._memory, memory)
         discrete_state.set_value(self._contact, contact)
-        along = memory.view(MEMORY)["along"][0]
-        discrete_state.set_value(self._along, along)

@@ -1,5 +1,6 @@
 """True contact forces, for scoring only."""
 
+import math
 from collections.abc import Iterable
 
 import numpy as np
@@ -88,7 +89,8 @@ class ContactLoad(LeafSystem):
                 continue
             outside = b if a in self._bodies else a
             row = 0 if outside == self._other else 1
-            load[row] += np.linalg.norm(contact.contact_force())
+            force = contact.contact_force()
+            load[row] += math.sqrt(force @ force)
         output.SetFromVector(load)
 
 
