@@ -60,10 +60,10 @@ from makebreak.gap.problem import (
 from makebreak.gap.report.clock import zero_of
 from makebreak.gap.report.summary import says_of
 from makebreak.gap.residuals.command_times import set_command_times
-from makebreak.gap.residuals.contact_means import SLIDES
 from makebreak.gap.residuals.contact_problem import ContactProblem
 from makebreak.gap.residuals.driven import DrivenProblem, is_driven
 from makebreak.gap.residuals.impacts import ImpactProblem, runs_against, without_contact
+from makebreak.gap.residuals.in_mujoco import MujocoProblem, by_mujoco
 from makebreak.gap.residuals.inverse import LOOPS
 from makebreak.gap.residuals.late_poses import contact_problem
 from makebreak.gap.residuals.lying_on_faces import point_on_face
@@ -133,9 +133,6 @@ MOST_SEC, MOST_ROWS = 60.0, 120_000
 # Windows that tell how far a step errs: where that decides which one is taken, and
 # where it is only said.
 ASKED, TOLD_BY = 24, 8
-# Slip of soft contacts that hold [m/s]: MuJoCo's friction stops what moves within a
-# hundredth of a second, of what its weight presses down by 0.5 to 1 of that.
-CREEP = 0.1
 # Of what is only reported on.
 REPORTED_SEC, REPORTED_ROWS = 20.0, 40_000
 
@@ -279,7 +276,18 @@ def _compared(
     budget, seconds = present(), {}
     is_mechanism = _is_mechanism(dynamics, parts.decided)
     decided, reported, done = _conditioned(parts, dynamics, is_mechanism and not meets)
+    reported = excerpt(reported, REPORTED_SEC, REPORTED_ROWS) if reported else []
     say("preparing motions and windows")
+    if meets or not is_mechanism:
+        result = budget.if_time(
+            "simulating windows with MuJoCo",
+            partial(_in_mujoco, scene, decided, reported, [*checks, *done], jobs, say),
+            None,
+        )
+        seconds["MuJoCo"] = clock.lap()
+        if result is not None:
+            return unless_doubtful(result).with_seconds(seconds)
+        say("preparing motions and windows")
     if is_mechanism and not meets:
         scene = without_shapes(scene)
     problem, found = problem_for(scene, decided, dynamics, jobs, meets)
@@ -303,7 +311,6 @@ def _compared(
         selection = select(problem, say)
     seconds["select"] = clock.lap()
     say("simulating held-out windows")
-    reported = excerpt(reported, REPORTED_SEC, REPORTED_ROWS) if reported else []
     with budget.part(CONCLUDE):
         try:
             result = conclude(problem, selection, reported, checks, jobs)
@@ -328,22 +335,6 @@ def _compared(
         if not explains_more(named, result):
             return first
         searched.undone[:] = own.undone
-        return other, then, named
-
-    def with_creep() -> tuple[GapProblem, Selection, GapResult]:
-        """Where friction holds softly: what creeps is no slip."""
-        pressing = isinstance(problem, PressingProblem)
-        made = _pressing_problem if pressing else _contact_problem
-        say("preparing contacts that creep")
-        other, found = made(scene, decided, CREEP)
-        if other.rich_left > AGREEMENT_RMS_MAX:  # Nor does all that is ordinary then.
-            return problem, selection, result
-        say("searching the catalogue with contacts that creep")
-        then = select(other, say)
-        with budget.part(CONCLUDE):
-            named = conclude(other, then, reported, [*checks, *found, creep()], jobs)
-        if named.verdict in ("gap_unnamed", "not_judged"):
-            return problem, selection, result
         return other, then, named
 
     def between_impacts(problem: FlightProblem) -> GapResult:
@@ -381,11 +372,6 @@ def _compared(
         )
         seconds["impacts"] = clock.lap()
     again: ProblemOf = partial(problem_for, meets=meets)
-    touching = isinstance(problem, ContactProblem)
-    if result.verdict == "gap_unnamed" and touching:
-        what, now = "comparing with contacts that creep", (problem, selection, result)
-        problem, selection, result = budget.if_time(what, with_creep, now)
-        seconds["creep"] = clock.lap()
     if result.verdict == "gap_unnamed" and is_driven(scene, decided):
         was, what = problem, "comparing in another way"
         problem, selection, result = budget.if_time(
@@ -534,27 +520,32 @@ def other_problem(
 
 
 def _contact_problem(
-    scene: Scene, recordings: Sequence[Recording], slides: float = SLIDES
+    scene: Scene, recordings: Sequence[Recording]
 ) -> tuple[ContactProblem, list[Finding]]:
-    contact = contact_problem(scene, recordings, slides=slides)
+    contact = contact_problem(scene, recordings)
     return contact, sap_lift(contact) + point_on_face(contact, contact.lying())
 
 
-def creep() -> Finding:
-    """What is said where contacts that creep explain what others do not."""
-    says = (
-        f"Contacts that slip slower than {CREEP:g} m/s press back with less friction "
-        "than they could, as soft contacts of a simulator do that creep (MuJoCo's, "
-        "say): there any friction up to its limit was allowed. Slow slip says nothing "
-        "of a friction that is smaller than the model's."
-    )
-    return Finding("contacts_creep", "", "time", CREEP, "m/s", "warning", says)
+def _in_mujoco(
+    scene: Scene, recordings: Sequence[Recording], reported: Sequence[Recording],
+    checks: Sequence[Finding], jobs: int, say: Callable[[str], None],
+) -> GapResult | None:  # fmt: skip
+    """What a scene of one MJCF file comes to, if MuJoCo, with the contact of that file,
+    does what was measured, or does with what is named; else None."""
+    try:
+        problem = MujocoProblem(scene, recordings)
+    except DoesNotFit:
+        return None
+    say("searching the catalogue in MuJoCo")
+    selection = select(problem, say)
+    with present().part(CONCLUDE):
+        found = [*checks, by_mujoco(problem)]
+        result = conclude(problem, selection, reported, found, jobs)
+    return result if result.verdict in ("no_gap", "gap_named", "ambiguous") else None
 
 
-def _pressing_problem(
-    scene: Scene, recordings: Sequence[Recording], slides: float = SLIDES
-):
-    pressing = PressingProblem(scene, recordings, slides=slides)
+def _pressing_problem(scene: Scene, recordings: Sequence[Recording]):
+    pressing = PressingProblem(scene, recordings)
     return pressing, point_on_face(pressing, pressing.lying())
 
 

@@ -57,12 +57,33 @@ class PlainMjcf:
 
 def plain_mjcf(path: Path) -> PlainMjcf:
     """Raises: ValueError, one line, for what MuJoCo refuses, or where it is missing."""
-    model, name, left_out = _compiled(path)
-    return _Writer(model, name, left_out).write()
+    spec, model, left_out = _compiled(path)
+    return _Writer(model, _name_of(spec, path), left_out).write()
+
+
+def named_spec(path: Path):
+    """The file as MuJoCo has it (MjSpec), all of whose bodies, joints and shapes have
+    the names that they have in plain_mjcf, and what writes it.
+
+    Raises: as plain_mjcf.
+    """
+    spec, model, left_out = _compiled(path)
+    writer = _Writer(model, _name_of(spec, path), left_out)
+    for kind, each in (
+        ("body", spec.bodies[1:]), ("joint", spec.joints), ("geom", spec.geoms)
+    ):  # fmt: skip
+        for one in each:
+            one.name = writer.name_of(kind, one.id)
+    return spec, writer
+
+
+def _name_of(spec, path: Path) -> str:
+    name = spec.modelname
+    return path.stem if name in ("", "MuJoCo Model") else name
 
 
 def _compiled(path: Path):
-    """MuJoCo's model, its name, and how many collision meshes are not there."""
+    """MjSpec, its compiled model, and how many collision meshes are not there."""
     try:
         import mujoco
     except ImportError:
@@ -86,8 +107,7 @@ def _compiled(path: Path):
         raise ValueError(f"{path}: MuJoCo says: {' '.join(str(error).split())}") from (
             None
         )
-    name = spec.modelname
-    return model, path.stem if name in ("", "MuJoCo Model") else name, left_out
+    return spec, model, left_out
 
 
 def _unreadable_meshes(spec, folder: Path) -> set[str]:
@@ -205,7 +225,7 @@ class _Writer:
             tuple(self.notes), self.left_out, self._order(),
             tuple(
                 ("", 1.0) if (j := self._driven(a)) is None
-                else (self._name("joint", j), float(m.actuator_gear[a][0]))
+                else (self.name_of("joint", j), float(m.actuator_gear[a][0]))
                 for a in range(len(m.actuator_trntype))
             ),
             bool(np.any((m.geom_bodyid == 0) & (m.geom_contype | m.geom_conaffinity))),
@@ -218,7 +238,7 @@ class _Writer:
         of: dict[tuple[int, str], tuple[int, float]] = {}  # Priority, friction.
         for g in np.flatnonzero(m.geom_contype | m.geom_conaffinity):
             body = int(m.geom_bodyid[g])
-            name = self._name("body", body) if body else self._fixed(int(g))
+            name = self.body_of(int(g))
             own = int(m.geom_priority[g]), float(m.geom_friction[g][0])
             of[body, name] = max(own, of.get((body, name), own))
         found, beyond = list[tuple[str, str, float, bool]](), set[str]()
@@ -242,13 +262,13 @@ class _Writer:
     def _order(self) -> tuple[tuple[str, int], ...]:
         m = self.m
         return tuple(
-            (self._name("joint", j), 4 if m.jnt_type[j] == 1 else 1)
+            (self.name_of("joint", j), 4 if m.jnt_type[j] == 1 else 1)
             if m.jnt_type[j]
-            else (self._name("body", int(m.jnt_bodyid[j])), 7)
+            else (self.name_of("body", int(m.jnt_bodyid[j])), 7)
             for j in range(m.njnt)
         )
 
-    def _name(self, kind: str, index: int) -> str:
+    def name_of(self, kind: str, index: int) -> str:
         """The name of a body, joint or other element, or one by its number."""
         known = self.named.get((kind, index))
         if known is None:
@@ -286,8 +306,8 @@ class _Writer:
             # A chain of bodies without mass, one for each joint.
             for j, (X, p, _) in zip(joints, links, strict=True):
                 last = j == first + n - 1
-                own = self._name("body", i)
-                name = own if last else f"{own}_{self._name('joint', j)}"
+                own = self.name_of("body", i)
+                name = own if last else f"{own}_{self.name_of('joint', j)}"
                 at = ET.SubElement(
                     at, "body", name=name, pos=_numbers(pos + R @ p),
                     quat=_numbers(_quaternion(R @ X)),
@@ -298,7 +318,7 @@ class _Writer:
             for X, p, _ in links:
                 pos, R = pos + R @ p, R @ X
             at = ET.SubElement(
-                parent, "body", name=self._name("body", i), pos=_numbers(pos),
+                parent, "body", name=self.name_of("body", i), pos=_numbers(pos),
                 quat=_numbers(_quaternion(R)),
             )  # fmt: skip
             for j in joints:
@@ -314,13 +334,13 @@ class _Writer:
         self._shapes(i, at)
         if m.body_gravcomp[i]:
             self.notes.append(
-                f"body {self._name('body', i)}: gravcomp {m.body_gravcomp[i]:g} is "
+                f"body {self.name_of('body', i)}: gravcomp {m.body_gravcomp[i]:g} is "
                 "left out, so all of its weight loads the joints"
             )
         return at
 
     def _joint(self, j: int, at: ET.Element) -> None:
-        m, name = self.m, self._name("joint", j)
+        m, name = self.m, self.name_of("joint", j)
         kind = ("free", "ball", "slide", "hinge")[m.jnt_type[j]]
         dof = m.jnt_dofadr[j]
         one = kind in ("slide", "hinge")
@@ -373,8 +393,12 @@ class _Writer:
     def _fixed(self, geom: int) -> str:
         """The name of the body that has one of the world's own shapes."""
         name = self.m.geom(geom).name or f"ground_{geom}"
-        taken = {self._name("body", k) for k in range(1, self.m.nbody)}
+        taken = {self.name_of("body", k) for k in range(1, self.m.nbody)}
         return f"{name}_fixed" if name in taken else name
+
+    def body_of(self, geom: int) -> str:
+        body = int(self.m.geom_bodyid[geom])
+        return self.name_of("body", body) if body else self._fixed(geom)
 
     def _shapes(self, body: int, at: ET.Element) -> None:
         first = self.m.body_geomadr[body]
@@ -398,11 +422,12 @@ class _Writer:
         else:
             if touches:
                 self.notes.append(
-                    f"geom {self._name('geom', g)}: a shape of type {kind} is left out"
+                    f"geom {self.name_of('geom', g)}: a shape of type {kind} is left "
+                    "out"
                 )
             return
         attributes = {
-            "name": self._name("geom", g), "type": kind, **more, "mass": "0",
+            "name": self.name_of("geom", g), "type": kind, **more, "mass": "0",
             "pos": _numbers(m.geom_pos[g]), "quat": _numbers(m.geom_quat[g]),
             "friction": _numbers(m.geom_friction[g][:1]),
             "rgba": _numbers(m.geom_rgba[g]),
@@ -429,8 +454,8 @@ class _Writer:
         for pair in m.exclude_signature:
             one, two = int(pair) >> 16, int(pair) & 0xFFFF
             ET.SubElement(
-                contact, "exclude", body1=self._name("body", one),
-                body2=self._name("body", two),
+                contact, "exclude", body1=self.name_of("body", one),
+                body2=self.name_of("body", two),
             )  # fmt: skip
 
     # ----- Constraints and actuators
@@ -443,8 +468,8 @@ class _Writer:
             kind = mj.mjtEq(m.eq_type[e])
             if kind == mj.mjtEq.mjEQ_JOINT and m.eq_obj2id[e] >= 0:
                 ET.SubElement(
-                    found, "joint", joint1=self._name("joint", m.eq_obj1id[e]),
-                    joint2=self._name("joint", m.eq_obj2id[e]),
+                    found, "joint", joint1=self.name_of("joint", m.eq_obj1id[e]),
+                    joint2=self.name_of("joint", m.eq_obj2id[e]),
                     polycoef=_numbers(m.eq_data[e][:5]),
                 )  # fmt: skip
                 continue
@@ -467,11 +492,11 @@ class _Writer:
             elsewhere |= j is None
             if j is not None:
                 drive = self._drive(a, j)
-                name = self._name("joint", j)
+                name = self.name_of("joint", j)
                 known = drives.get(name)
                 if drive is None:
                     drive = FileDrive()
-                    lost.append(self._name("actuator", a))
+                    lost.append(self.name_of("actuator", a))
                 if known is not None:  # A position and a velocity servo together.
                     drive = FileDrive(
                         known.kp + drive.kp, known.kd + drive.kd,
@@ -479,7 +504,7 @@ class _Writer:
                     )  # fmt: skip
                 drives[name] = drive
             else:
-                lost.append(self._name("actuator", a))
+                lost.append(self.name_of("actuator", a))
         if lost:
             shown = ", ".join(lost[:6]) + (", ..." if lost[6:] else "")
             self.notes.append(
@@ -493,7 +518,7 @@ class _Writer:
                 attributes["ctrllimited"] = "true"
                 attributes["ctrlrange"] = _numbers([-drive.limit, drive.limit])
             ET.SubElement(motors, "motor", attributes)
-        joints = [self._name("joint", j) for j in range(m.njnt) if m.jnt_type[j] >= 2]
+        joints = [self.name_of("joint", j) for j in range(m.njnt) if m.jnt_type[j] >= 2]
         return drives, tuple(
             name for name in joints if drives and not elsewhere and name not in drives
         )
@@ -529,8 +554,9 @@ class _Writer:
             kp, kd = g * gear**2, -b2 * gear**2
             if integrates:
                 self.notes.append(
-                    f"actuator {self._name('actuator', a)}: its command is a velocity "
-                    "that MuJoCo adds up to a position; here it follows a position"
+                    f"actuator {self.name_of('actuator', a)}: its command is a "
+                    "velocity that MuJoCo adds up to a position; here it follows a "
+                    "position"
                 )
             return FileDrive(kp, kd, min(limits), gear)
         if integrates:
@@ -548,7 +574,7 @@ class _Writer:
         m = self.m
         start = m.key_qpos[0] if m.nkey else m.qpos0
         return {
-            self._name("joint", j): float(start[m.jnt_qposadr[j]])
+            self.name_of("joint", j): float(start[m.jnt_qposadr[j]])
             for j in range(m.njnt)
             if m.jnt_type[j] >= 2 and start[m.jnt_qposadr[j]]
         }
@@ -564,7 +590,7 @@ class _Writer:
             there = [word for word, value in words.items() if np.any(value)]
             if there:
                 self.notes.append(
-                    f"tendon {self._name('tendon', t)}: its {' and '.join(there)} "
+                    f"tendon {self.name_of('tendon', t)}: its {' and '.join(there)} "
                     "left out"
                 )
         if m.nflex:

@@ -74,7 +74,7 @@ def to_mjcf(scene: Scene) -> Exported:
     )  # fmt: skip
     world = ET.SubElement(root, "worldbody")
     elements = {plant.world_body().index(): world}
-    payloads = _payloads(plant)
+    payloads = payloads_of(plant)
     motors = ET.Element("actuator")
     joints = [plant.get_joint(i) for i in plant.GetJointIndices()]
     todo = [j for j in joints if not _is_added(model_of(plant, j.child_body()))]
@@ -88,7 +88,7 @@ def to_mjcf(scene: Scene) -> Exported:
             parent = elements[joint.parent_body().index()]
             at = ET.SubElement(parent, "body", attributes)
             elements[body.index()] = at
-            inertial = _inertial(body, payloads)
+            inertial = inertial_of(body, payloads)
             if inertial.mass > 0.0:
                 six = inertial.central[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
                 ET.SubElement(
@@ -128,12 +128,12 @@ def _own_file(scene: Scene, model: str, suffix: str) -> Exported:
     plant = loaded.plant
     document = minidom.parse(str(files[model]))
     instance = plant.GetModelInstanceByName(model)
-    payloads = _payloads(plant)
+    payloads = payloads_of(plant)
     for link in document.getElementsByTagName("link"):
         if not link.hasAttribute("name"):
             continue
         body = plant.GetBodyByName(link.getAttribute("name"), instance)
-        inertial = _inertial(body, payloads)
+        inertial = inertial_of(body, payloads)
         if not children(link, "inertial"):
             if inertial.mass == 0.0:
                 continue
@@ -203,7 +203,7 @@ def _is_added(model: str) -> bool:
     return model.startswith(("payload_on_", "motor_of_"))
 
 
-def _payloads(plant: MultibodyPlant) -> dict[int, list[RigidBody]]:
+def payloads_of(plant: MultibodyPlant) -> dict[int, list[RigidBody]]:
     """{index of a body: the payloads that are welded to it}."""
     found: dict[int, list[RigidBody]] = {}
     for joint in (plant.get_joint(i) for i in plant.GetJointIndices()):
@@ -213,7 +213,7 @@ def _payloads(plant: MultibodyPlant) -> dict[int, list[RigidBody]]:
     return found
 
 
-def _inertial(body: RigidBody, payloads) -> Inertial:
+def inertial_of(body: RigidBody, payloads) -> Inertial:
     """Inertial properties of a body with its payloads, which have the body's axes."""
     M = body.default_spatial_inertia()
     mass, moment = M.get_mass(), M.get_mass() * M.get_com()
@@ -254,7 +254,7 @@ def _mjcf_joint(loaded: LoadedScene, joint: Joint, body, motors) -> None:
     turns = isinstance(joint, RevoluteJoint)
     axis = joint.revolute_axis() if turns else joint.translation_axis()
     X_BM = joint.frame_on_child().GetFixedPoseInBodyFrame()
-    drive = _drive_of(loaded, joint)
+    drive = joint_numbers(loaded, joint)
     attributes = {
         "name": name,
         "type": "hinge" if turns else "slide",
@@ -294,7 +294,7 @@ def _mjcf_joint(loaded: LoadedScene, joint: Joint, body, motors) -> None:
 
 
 @dataclass(frozen=True)
-class _Drive:
+class JointNumbers:
     """What a joint and its drive do, in numbers of other simulators. takes: commands of
     its control loop, of COMMANDS_OF; none: efforts. limit: of effort, of the motor.
     damping: with the motor's back-EMF."""
@@ -310,7 +310,7 @@ class _Drive:
     delay: float  # [s] Of its commands.
 
 
-def _drive_of(loaded: LoadedScene, joint: Joint) -> _Drive:
+def joint_numbers(loaded: LoadedScene, joint: Joint) -> JointNumbers:
     plant, name = loaded.plant, full_name(loaded.plant, joint)
     actuation, actuator = loaded.scene.actuation, actuator_of(plant, joint)
     law = law_of(actuation, name)
@@ -321,7 +321,7 @@ def _drive_of(loaded: LoadedScene, joint: Joint) -> _Drive:
         damping += float(law.emf)
         limit = min(limit, float(law.limit))
         kp, kd = _kp(loaded, name, float(law.kp)), float(law.kd)
-    return _Drive(
+    return JointNumbers(
         actuator is not None and name in actuation.joints,
         () if law is None else COMMANDS_OF[actuation.type],
         kp, kd, limit, damping, _sum_of(loaded, joint, "friction"),
@@ -358,9 +358,9 @@ def to_isaac_lab(scene: Scene) -> Exported:
     """
     loaded = _load(scene)
     plant = loaded.plant
-    groups: dict[float, dict[str, _Drive]] = {}
+    groups: dict[float, dict[str, JointNumbers]] = {}
     for joint in one_dof_joints(plant):
-        drive = _drive_of(loaded, joint)
+        drive = joint_numbers(loaded, joint)
         if drive.is_driven and not _is_added(model_of(plant, joint)):
             groups.setdefault(drive.delay, {})[re.escape(joint.name())] = drive
     if not groups:

@@ -78,7 +78,6 @@ def outcomes(monkeypatch, error):
     )
     problem = SimpleNamespace(
         scene=None,
-        slides=0.0,
         recordings=[],
         tracks=[],
         _windows=None,

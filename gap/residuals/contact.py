@@ -148,10 +148,7 @@ def _is_alone(model: FreeBodyModel | WindowModel) -> bool:
 
 
 def _met_axes(model: FreeBodyModel | WindowModel, at: str) -> dict[str, float]:
-    """{axis of the world: where a face of a body is met along it}; windows that Drake
-    simulates are too slow to ask."""
-    if not isinstance(model, FreeBodyModel):
-        return {}
+    """{axis of the world: where a face of a body is met along it}."""
     return {axis: off for (name, axis), off in model.met.items() if name == at}
 
 

@@ -7,7 +7,7 @@ some of the free motion between, which show friction and drives. A window begins
 the touch, from a state that is smoothed on that side alone.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -432,7 +432,7 @@ class ImpactProblem(ImpactWindows, WindowedProblem):
                     (f"{kind} of {at}", Effect(kind, [at], {name: now + step}), step)
                 )
         for name, effect, size in changes:
-            moved = self._try((), effect)
+            moved = tried(self, effect)
             if moved is None:
                 continue
             column = (self.base() - moved) / size
@@ -474,10 +474,10 @@ class ImpactProblem(ImpactWindows, WindowedProblem):
         """(m, k) what each kind with one parameter does at each joint, in its first
         step; but those that make commands late."""
         columns = []
-        for kind, at, name, trials in self._of_joints():
+        for kind, at, name, trials in kinds_of_joints(self):
             moved = None
             if KINDS[kind].path not in ("delay", "lag"):
-                moved = self._try((), Effect(kind, [at], {name: trials[0][1]}))
+                moved = tried(self, Effect(kind, [at], {name: trials[0][1]}))
             if moved is not None and np.abs(self.base() - moved).max() > 1e-3:
                 columns.append(self.base() - moved)
         return np.stack(columns, 1) if columns else np.zeros((len(self.base()), 0))
@@ -559,36 +559,9 @@ class ImpactProblem(ImpactWindows, WindowedProblem):
                     found[pair] = found.get(pair, np.zeros(3)) + across
         return found
 
-    def _try(self, there: Sequence[Effect], effect: Effect) -> np.ndarray | None:
-        try:
-            return self.residual([*there, effect])
-        except (ValueError, RuntimeError):
-            return None
-
     def candidates(self, nuisances: Nuisances, current: Fitted) -> list[Candidate]:
-        found = []
-        taken = {(e.kind, at) for e in current.effects for at in e.at}
-        for kind, at, name, trials in [
-            *self._of_contacts(), *self._of_places(), *self._of_joints(),
-        ]:  # fmt: skip
-            if (kind, at) in taken:
-                continue
-            columns, readers = [], []
-            for step, value in trials:
-                trial = [(step, {name: value})]
-                moved = self._try(current.effects, Effect(kind, [at], {name: value}))
-                if moved is None or not np.abs(current.r - moved).max() > 1e-3:
-                    continue
-                columns.append(((current.r - moved) / step)[:, None])
-                readers.append(reader_of_trial(kind, (name,), trial))
-            if columns:
-                least = self.least(kind, [at])
-                found.append(
-                    Candidate(
-                        kind, (at,), 1, tuple(columns), tuple(readers), least=least
-                    )
-                )
-        return found
+        trials = [*self._of_contacts(), *self._of_places(), *kinds_of_joints(self)]
+        return candidates_of(self, trials, current)
 
     def _of_contacts(self):
         for at in self._pairs():
@@ -614,36 +587,69 @@ class ImpactProblem(ImpactWindows, WindowedProblem):
             if at in self.dynamics.places(PLACE):
                 yield PLACE, at, axis, [(x, x) for x in PLACES]
 
-    def _of_joints(self):
-        """Kinds with one parameter, at each joint."""
-        dynamics, plant = self.dynamics, self.dynamics.plant
-        M = np.diag(plant.CalcMassMatrix(plant.CreateDefaultContext()))
-        for joint in one_dof_joints(plant):
-            at, i = full_name(plant, joint), joint.velocity_start()
-            path = [
-                p[f"{at}.position"]
-                for p in self._paths.values()
-                if f"{at}.position" in p
-            ]
-            if not path:
+
+def kinds_of_joints(model: WindowModel):
+    """(kind, place, parameter, trials) of kinds with one parameter, at each joint; a
+    trial is a step and the value with it."""
+    dynamics, plant = model.dynamics, model.dynamics.plant
+    M = np.diag(plant.CalcMassMatrix(plant.CreateDefaultContext()))
+    for joint in one_dof_joints(plant):
+        at, i = full_name(plant, joint), joint.velocity_start()
+        path = [
+            p[f"{at}.position"] for p in model._paths.values() if f"{at}.position" in p
+        ]
+        if not path:
+            continue
+        x = np.concatenate(path)
+        speed = float(np.sqrt(np.mean(x[:, 1] ** 2))) or 1e-3
+        effort = float(M[i] * np.median(np.abs(x[:, 2]))) or 1e-3
+        for kind, entry in KINDS.items():
+            if entry.at not in ("joint", "actuator") or len(entry.parameters) != 1:
                 continue
-            x = np.concatenate(path)
-            speed = float(np.sqrt(np.mean(x[:, 1] ** 2))) or 1e-3
-            effort = float(M[i] * np.median(np.abs(x[:, 2]))) or 1e-3
-            for kind, entry in KINDS.items():
-                if entry.at not in ("joint", "actuator") or len(entry.parameters) != 1:
-                    continue
-                if at not in dynamics.places(kind) or entry.hidden_state:
-                    continue
-                (p,) = entry.parameters
-                now = dynamics.now(kind, [at]).get(p.name, 0.0)
-                step = {
-                    "N m": SMALL * effort,
-                    "N m s/rad": SMALL * effort / speed,
-                    "N m s2/rad2": SMALL * effort / speed**2,
-                    "kg m2": 0.1 * float(M[i]),
-                    "s": 0.002,
-                    "": 0.05,
-                }.get(p.unit)
-                if step is not None and abs(now) < 1e20:
-                    yield kind, at, p.name, [(step, now + step)]
+            if at not in dynamics.places(kind) or entry.hidden_state:
+                continue
+            (p,) = entry.parameters
+            now = dynamics.now(kind, [at]).get(p.name, 0.0)
+            step = {
+                "N m": SMALL * effort,
+                "N m s/rad": SMALL * effort / speed,
+                "N m s2/rad2": SMALL * effort / speed**2,
+                "kg m2": 0.1 * float(M[i]),
+                "s": 0.002,
+                "": 0.05,
+            }.get(p.unit)
+            if step is not None and abs(now) < 1e20:
+                yield kind, at, p.name, [(step, now + step)]
+
+
+def candidates_of(
+    model: WindowedProblem, trials: Iterable, current: Fitted
+) -> list[Candidate]:
+    """Candidates of one parameter, by simulating them beside what is there now.
+
+    Args: trials: (kind, place, parameter, [(step, value with it), ...]) of each.
+    """
+    found = []
+    taken = {(e.kind, at) for e in current.effects for at in e.at}
+    for kind, at, name, steps in trials:
+        columns, readers = [], []
+        for step, value in steps if (kind, at) not in taken else ():
+            moved = tried(model, *current.effects, Effect(kind, [at], {name: value}))
+            if moved is None or not np.abs(current.r - moved).max() > 1e-3:
+                continue
+            columns.append(((current.r - moved) / step)[:, None])
+            readers.append(reader_of_trial(kind, (name,), [(step, {name: value})]))
+        if columns:
+            least = model.least(kind, [at])
+            found.append(
+                Candidate(kind, (at,), 1, tuple(columns), tuple(readers), least=least)
+            )
+    return found
+
+
+def tried(model: WindowedProblem, *effects: Effect) -> np.ndarray | None:
+    """The residual with effects; None where the scene cannot have them."""
+    try:
+        return model.residual(effects)
+    except (ValueError, RuntimeError):
+        return None

@@ -141,6 +141,16 @@ class CommandPorts:
             for port in self._ports
         ]
 
+    def columns(self, times: np.ndarray) -> dict[str, np.ndarray]:
+        """{channel: (n,)} what holds at the times (n,) [s]."""
+        return {
+            channel: column
+            for port in self._ports
+            for channel, column in zip(
+                port.channels, self._held(port, times[:, None]).T, strict=True
+            )
+        }
+
     def _held(self, port: _Port, time: float | np.ndarray) -> np.ndarray:
         """(n_u,) what holds at a time, entry by entry; or (n, n_u) at times (n, 1)."""
         late = time - port.delays + SAME_SEC

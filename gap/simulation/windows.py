@@ -169,6 +169,8 @@ class WindowModel(WindowedResidual):
 
     commands_late = 0.0
     rows_sec = 0.0  # Rows closer than this are left out.
+    # {(fixed body, axis of the world): where it is met}, where that is asked.
+    met: Mapping[tuple[str, str], float] = {}
 
     def __init__(
         self,

@@ -1,0 +1,223 @@
+"""A scene of one MJCF file, by windows that MuJoCo simulates with that file's contact.
+
+What is soft there creeps, lands and slides otherwise than in Drake: by more than the
+noise of a log that MuJoCo made. Rows are of samples over the covariance that they have
+in a window: noise, what an uncertain start does, which goes together throughout, and
+what contacts that chatter do by chance.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+
+from makebreak.gap.data.findings import Finding
+from makebreak.gap.data.recording import Recording
+from makebreak.gap.does_not_fit import DoesNotFit
+from makebreak.gap.problem import Candidate, Fitted, Nuisances, SearchPlan
+from makebreak.gap.residuals.impacts import candidates_of, kinds_of_joints, tried
+from makebreak.gap.residuals.objects import MOST_EFFECTS, WindowedProblem
+from makebreak.gap.simulation.mujoco_simulation import MujocoSimulation
+from makebreak.gap.simulation.windows import LARGEST, Window, WindowModel, seen_in
+from makebreak.gap.thresholds import UNEXPLAINED_RMS
+from makebreak.models.effects.ground import PLACE
+from makebreak.models.effects.kind import Effect
+from makebreak.models.scene import Scene
+
+WINDOW_SEC, MOST = 0.6, 60
+# Variance between two runs whose contacts chatter by chance, over that of what is bent.
+CHANCE = 1.33
+PART_SEC = 0.1  # Of a window, where parts are held out.
+# Of how far a parameter is from the scene: where the sum of squares is asked.
+ASIDE = (-0.4, -0.2, -0.1, -0.05, 0.0, 0.05, 0.1, 0.2, 0.4)
+UNEVEN = 0.5  # What is held out must have so much of the error.
+BLUR = 0.002  # Of how far a channel goes: where steps fall between rows is not known.
+
+
+class MujocoProblem(WindowModel, WindowedProblem):
+    """Anything that MuJoCo can simulate, as a problem for the search.
+
+    Raises: DoesNotFit as MujocoSimulation.
+    """
+
+    plan = SearchPlan(
+        evaluations=10, diff_step=0.02, least_gain=0.05, most_effects=MOST_EFFECTS,
+        jumps=True, loud=UNEXPLAINED_RMS,
+    )  # fmt: skip
+
+    def __init__(self, scene: Scene, recordings: Sequence[Recording]):
+        super().__init__(
+            scene, recordings, WINDOW_SEC, most=MOST,
+            simulation=MujocoSimulation(scene),
+        )  # fmt: skip
+        if any(map(self._by_measured, self.recordings)):
+            raise DoesNotFit("measured efforts drive the joints: these drift")
+        self.windows = list(self.windows)
+        self._weighed_by: tuple = ()
+        self._in_parts = False
+        self._weigh(())
+        self._share_out()
+
+    def _share_out(self) -> None:
+        """Every third window is held out, of those that differ as much: most of a log
+        may be rest. Where one window has it all, every third part of each is."""
+        square, number = self.base() ** 2, self.blocks()
+        off = np.bincount(number, square) / np.maximum(np.bincount(number), 1)
+        train = np.ones(len(off), bool)
+        train[np.argsort(off)[::-1][1::3]] = False
+        self.windows = [
+            replace(w, train=bool(t)) for w, t in zip(self.windows, train, strict=True)
+        ]
+        held = off[~train].mean() if len(off) > 1 else 0.0
+        self._in_parts = bool(held < UNEVEN * off[train].mean())
+
+    def train(self) -> np.ndarray:
+        if not self._in_parts:
+            return super().train()
+        part = [
+            np.repeat(
+                (self.recordings[w.recording].time[w.rows] - w.start) // PART_SEC,
+                len(self.channels),
+            )
+            for w in self.windows
+        ]
+        return (np.concatenate(part) % 3 != 1)[self.measured()]
+
+    def loudest(self, fitted: Fitted) -> tuple[str, float]:
+        """The window of which most is left."""
+        square, number = fitted.left**2, self.blocks()
+        off = np.bincount(number, square) / np.maximum(np.bincount(number), 1)
+        k = int(np.argmax(off))
+        w = self.windows[k]
+        name = self.recordings[w.recording].name
+        end = w.start + self.window_sec
+        return f"{name} from {w.start:.3g} to {end:.3g} s", float(np.sqrt(off[k]))
+
+    @property
+    def met(self) -> dict[tuple[str, str], float]:
+        """Of everything that is fixed it is asked along each axis."""
+        places = self.dynamics.places(PLACE)
+        return {(at, axis): 0.0 for at in places for axis in "xyz"}
+
+    def _model(self) -> WindowModel:
+        return self
+
+    def _again(self, recordings: Sequence[Recording]) -> WindowModel:
+        return type(self)(self.scene, recordings)
+
+    def _weigh(self, effects: Sequence[Effect]) -> None:
+        """Rows by the covariance that a window's samples have with these effects:
+        noise, and what one deviation of each part of an uncertain start does, which
+        goes together throughout the window."""
+        kept, self._base = self.windows, None
+        plain = self.simulate(effects)
+        moved, bent = [], [np.zeros_like(y) for y in plain]
+        try:
+            for name, k in product(kept[0].state, (0, 1)):
+                pair = []
+                for sign in (1.0, -1.0):
+                    self.windows = [_moved(w, name, k, sign) for w in kept]
+                    pair.append(self.simulate(effects))
+                # What is straight in it, and what is bent.
+                moved.append([0.5 * (a - b) for a, b in zip(*pair, strict=True)])
+                moved.append(
+                    [0.5 * (a + b) - y for a, b, y in zip(*pair, plain, strict=True)]
+                )
+                for total, y in zip(bent, moved[-1], strict=True):
+                    total += np.nan_to_num(y**2)
+        finally:
+            self.windows = kept
+        far = np.max([np.nan_to_num(np.ptp(y, axis=0)) for y in plain], axis=0)
+        own = np.sqrt(self.noise**2 + (BLUR * far) ** 2)
+        self._own, self._start = [], []
+        for k, w in enumerate(kept):
+            mine = np.sqrt(own**2 + CHANCE * bent[k] / (len(moved) / 2))
+            self._own.append(mine)
+            by = np.stack([y[k] / mine for y in moved], axis=-1)
+            by = np.nan_to_num(by, posinf=0.0, neginf=0.0)
+            by[~np.isfinite(seen_in(self, w))] = 0.0
+            A, size, _ = np.linalg.svd(by.reshape(-1, len(moved)), full_matrices=False)
+            self._start.append((A, 1.0 - 1.0 / np.sqrt(1.0 + size**2)))
+            wide = mine * np.sqrt(1.0 + np.sum(by**2, axis=-1))
+            self.windows[k] = replace(w, std=wide)
+
+    def residual(self, effects: Sequence[Effect] = ()) -> np.ndarray:
+        simulated = self.simulate(effects)
+        each = []
+        for e, (A, less) in zip(
+            self.errors_over(simulated, self._own), self._start, strict=True
+        ):
+            e = np.clip(e, -LARGEST, LARGEST).ravel()
+            each.append(e - A @ (less * (A.T @ e)))
+        return np.concatenate(each)[self.measured()]
+
+    def reweigh(self, fitted: Fitted) -> bool:
+        key = tuple(e.kind for e in fitted.effects)
+        if self._weighed_by == key:
+            return False
+        self._weighed_by = key
+        self._weigh(fitted.effects)
+        return True
+
+    def widened(self, end: Fitted, k: int) -> tuple[dict[str, float], tuple[str, ...]]:
+        """By a parabola through the sum of squares about the best values, which is
+        rough where contacts chatter by chance: how far its bottom may be moved by
+        twice what it is rough by."""
+        effect, std = end.effects[k], dict(end.std[k])
+        now = self.dynamics.now(effect.kind, effect.at)
+        calm = self.nuisances().columns @ end.b
+        for name, value in effect.parameters.items():
+            reach = abs(value - now.get(name, 0.0))
+            steps = reach * np.array(ASIDE)
+            left = [
+                self._try_at(end, k, name, float(value + step), calm)
+                for step in steps if name in std and reach > 0.0
+            ]  # fmt: skip
+            good = np.isfinite(left)
+            if good.sum() < 5:
+                continue
+            d, left = steps[good], np.array(left)[good]
+            fit = np.polyfit(d, left, 2)
+            off = left - np.polyval(fit, d)
+            rough = float(np.sqrt(np.sum(off**2) / (len(d) - 3)))
+            if fit[0] <= 0.0:
+                std[name] = np.inf
+                continue
+            low = min(abs(0.5 * fit[1] / fit[0]), reach)
+            wide = np.hypot(low, np.sqrt(max(1.0, 2.0 * rough) / fit[0]))
+            std[name] = max(std[name], float(wide))
+        return std, ()
+
+    def _try_at(self, end: Fitted, k: int, name: str, value: float, calm) -> float:
+        """The sum of squares with one parameter of effect k moved; NaN where the scene
+        cannot have it."""
+        others = list(end.effects)
+        moved = {**others[k].parameters, name: value}
+        others[k] = Effect(others[k].kind, others[k].at, moved)
+        r = tried(self, *others)
+        return np.nan if r is None else float(np.sum((r - calm) ** 2))
+
+    def candidates(self, nuisances: Nuisances, current: Fitted) -> list[Candidate]:
+        found = super().candidates(nuisances, current)
+        return found + candidates_of(self, kinds_of_joints(self), current)
+
+
+def _moved(w: Window, name: str, k: int, sign: float) -> Window:
+    """The window from a start moved by one deviation along an axis of the uncertainty
+    of a signal's value and rate."""
+    values, u = np.linalg.eigh(w.spread[name])
+    x = np.array(w.state[name])
+    x[:2] += sign * u[:, k] * np.sqrt(max(values[k], 0.0))
+    return replace(w, state={**w.state, name: x})
+
+
+def by_mujoco(problem: MujocoProblem) -> Finding:
+    """That another simulator's contact was compared."""
+    says = (
+        f"Windows of {WINDOW_SEC:g} s were simulated by MuJoCo, with the contacts and "
+        "the time step of the model's own file. Drake's contacts are others: what "
+        "pushes, slides or lands there moves differently by more than the noise."
+    )
+    name = problem.recordings[0].name
+    return Finding("mujoco_contacts", name, "time", WINDOW_SEC, "s", "info", says)

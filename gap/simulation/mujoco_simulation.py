@@ -1,0 +1,87 @@
+"""Windows of recordings simulated by MuJoCo, with the contact of the model's file."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from makebreak.gap.budget import go_on
+from makebreak.gap.does_not_fit import DoesNotFit
+from makebreak.gap.simulation.scene_simulation import SceneSimulation
+from makebreak.gap.simulation.sensor_samples import between
+from makebreak.models.effects.kind import Effect
+from makebreak.models.mujoco_twin import MujocoTwin
+from makebreak.models.scene import InitialSection, Scene
+
+
+class MujocoSimulation(SceneSimulation):
+    """As SceneSimulation; MuJoCo makes the steps.
+
+    Raises: DoesNotFit for scenes that MujocoTwin does not take.
+    """
+
+    def __init__(self, scene: Scene):
+        try:
+            self._twins = MujocoTwin(scene)
+        except ValueError as error:
+            raise DoesNotFit(str(error)) from None
+        super().__init__(scene)
+        self.set_effects(scene.effects)
+
+    def set_effects(self, effects: Sequence[Effect]) -> None:
+        self._twin = self._twins.with_effects(effects)
+        self._current = tuple(effects)
+        self._commands.set_effects(self._current)
+
+    def channels(self) -> list[str]:
+        return [c for c in super().channels() if not self._channels.is_effort(c)]
+
+    def _simulate(
+        self,
+        initial: InitialSection,
+        start: float,
+        needed: np.ndarray,
+        is_true: bool,
+        want_efforts: bool,
+        twists: Mapping[str, tuple[float, float]],
+    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        import mujoco
+        from mujoco.rollout import rollout
+
+        go_on()
+        self.failure = ""
+        self._set_state(initial, is_true)
+        x = self._plant.GetPositionsAndVelocities(self._plant_context)
+        twin, n_q = self._twin, self._plant.num_positions()
+        model, dt = twin.model, self._twin.model.opt.timestep
+        data = mujoco.MjData(model)
+        data.qpos[twin.q] = x[:n_q]
+        data.qvel[twin.v] = x[n_q:]
+        for spin, quat in twin.spins:
+            R = np.zeros(9)
+            mujoco.mju_quat2Mat(R, x[quat : quat + 4])
+            data.qvel[twin.v[spin : spin + 3]] = (
+                R.reshape(3, 3).T @ x[n_q + spin : n_q + spin + 3]
+            )
+        n = max(int(np.ceil((needed[-1] - start) / dt - 1e-6)), 1)
+        time = start + dt * np.arange(n + 1)
+        control = np.zeros((n, model.nu))
+        for channel, values in self._commands.columns(time[:-1]).items():
+            if channel in twin.commands:
+                k, factor = twin.commands[channel]
+                control[:, k] += factor * values
+        spec = mujoco.mjtState.mjSTATE_FULLPHYSICS
+        first = np.zeros(mujoco.mj_stateSize(model, spec))
+        mujoco.mj_getState(model, data, first, spec)
+        states, _ = rollout(model, data, first[None], control[None], nstep=n)
+        every = np.vstack([first, states[0]])[:, 1:]
+        path = np.empty((n + 1, len(x)))
+        path[:, :n_q] = every[:, twin.q]
+        path[:, n_q:] = every[:, model.nq + twin.v]
+        for spin, quat in twin.spins:
+            w, u = path[:, quat : quat + 1], path[:, quat + 1 : quat + 4]
+            own = path[:, n_q + spin : n_q + spin + 3]
+            # Turned into the world by the quaternion.
+            path[:, n_q + spin : n_q + spin + 3] = own + 2.0 * np.cross(
+                u, np.cross(u, own) + w * own
+            )
+        return between(time, path, needed), {}

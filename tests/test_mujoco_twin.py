@@ -1,0 +1,108 @@
+"""A scene in MuJoCo: against MuJoCo itself with the same changes in the file."""
+
+import numpy as np
+import pytest
+
+mujoco = pytest.importorskip("mujoco")
+
+from makebreak.gap.does_not_fit import DoesNotFit  # noqa: E402
+from makebreak.gap.simulation.commands import Commands  # noqa: E402
+from makebreak.gap.simulation.mujoco_simulation import MujocoSimulation  # noqa: E402
+from makebreak.models.effects.kind import Effect  # noqa: E402
+from makebreak.models.scene import InitialSection, read_scene  # noqa: E402
+
+FILE = """
+<mujoco model="w"><option timestep="0.001" integrator="implicitfast"/>
+<default><geom condim="4"/></default><worldbody>
+<geom name="floor" type="plane" size="3 3 .1" friction="{floor}"/>
+<geom name="wall" type="box" size=".02 .5 .2" pos="{wall} 0 .2" euler="0 0 10"/>
+<body name="pusher" pos="0 0 .05"><joint name="px" type="slide" axis="1 0 0"
+ damping="{damping}" armature="{rotor}" frictionloss="{dry}"/>
+ <geom type="sphere" size=".02" mass=".5" friction="{tip}"/></body>
+<body name="box" pos=".12 .01 .04"><freejoint/>
+ <geom type="box" size="{size} .05 .04" mass="{mass}" friction=".3" solref=".03 1"/>
+</body></worldbody>
+<actuator><position joint="px" kp="{kp}" kv="30" forcerange="-40 40"/></actuator>
+</mujoco>"""
+PLAIN = {
+    "floor": 0.3, "wall": 0.4, "damping": 8.0, "rotor": 0.1, "dry": 0.2, "tip": 0.3,
+    "size": 0.06, "mass": 0.6, "kp": 600.0,
+}  # fmt: skip
+START = [0.0, 0.12, 0.01, 0.04, 1.0, 0.0, 0.0, 0.0]
+
+
+def own(**changes) -> np.ndarray:
+    """(n, 8) qpos every 10 ms of 0.8 s in which the box is pushed against the wall."""
+    model = mujoco.MjModel.from_xml_string(FILE.format(**PLAIN | changes))
+    data = mujoco.MjData(model)
+    data.qpos[:] = START
+    data.qvel[:] = [0.1, 0.0, 0.2, 0.0, 0.1, 0.2, 1.0]
+    rows = []
+    for step in range(800):
+        data.ctrl[:] = 0.3 * np.floor(step / 20) * 20 / 400
+        mujoco.mj_step(model, data)
+        if step % 10 == 9:
+            rows.append(np.array(data.qpos))
+    return np.array(rows)
+
+
+def simulated(folder, *effects: Effect) -> np.ndarray:
+    (folder / "w.xml").write_text(FILE.format(**PLAIN))
+    (folder / "scene.yaml").write_text(
+        "directives:\n- add_model: {name: w, file: w.xml}\n"
+        "actuation: {type: servo, joints: [w.px], kp: [600], kd: [30], limit: [40]}\n"
+    )
+    simulation = MujocoSimulation(read_scene(folder / "scene.yaml"))
+    simulation.set_effects([*simulation.scene.effects, *effects])
+    # In the world: the box begins level, so its own axes are the world's.
+    initial = InitialSection(
+        {"w.px": 0.0}, {"w.px": 0.1}, {"w.box": [1.0, 0, 0, 0, *START[1:4]]},
+        {"w.box": [0.1, 0.2, 1.0, 0.0, 0.2, 0.0]},
+    )  # fmt: skip
+    time = 0.02 * np.arange(40)
+    commands = Commands(time, {"w.px.position_command": 0.3 * time / 0.4})
+    axes = ("x", "y", "z", "qw", "qx", "qy", "qz")
+    channels = ["w.px.position", *(f"w.box.{a}" for a in axes)]
+    return simulation.run(
+        initial, 0.01 * np.arange(1, 81), channels, commands, start_sec=0.0
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "effects"),
+    [
+        ({}, []),
+        ({"mass": 0.9}, [("object_mass", "w.box", {"mass": 0.9})]),
+        ({"wall": 0.37}, [("wall_position", "w.wall", {"x": -0.03, "y": 0, "z": 0})]),
+        (
+            {"damping": 28.0, "rotor": 0.4, "dry": 1.2, "kp": 900.0},
+            [
+                ("joint_viscous_damping", "w.px", {"damping": 20.0}),
+                ("rotor_inertia", "w.px", {"inertia": 0.3}),
+                ("joint_coulomb_friction", "w.px", {"coulomb": 1.0}),
+                ("servo_gain", "w.px", {"kp": 900.0}),
+            ],
+        ),
+        # The larger of two shapes' friction counts, so a tip's is the pair's.
+        ({"tip": 0.8}, [("contact_friction", "w.box~w.pusher", {"friction": 0.8})]),
+        ({"floor": 0.6}, [("contact_friction", "w.box~w.floor", {"friction": 0.6})]),
+    ],
+)
+def test_effects_are_what_the_same_change_of_the_file_is(tmp_path, changes, effects):
+    each = [Effect(kind, [at], parameters) for kind, at, parameters in effects]
+    expected = own(**changes)
+    if changes:
+        assert np.abs(expected - own()).max() > 1e-3  # It shows.
+    np.testing.assert_allclose(simulated(tmp_path, *each), expected, atol=1e-7)
+
+
+def test_what_mujoco_has_no_place_for_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="no place for contact_stiffness"):
+        effect = Effect("contact_stiffness", ["w.box~w.floor"], {"stiffness": 1e4})
+        simulated(tmp_path, effect)
+    (tmp_path / "other.yaml").write_text(
+        "directives:\n- add_model: {name: ball, file: package://makebreak/models/"
+        "ball.sdf}\n"
+    )
+    with pytest.raises(DoesNotFit, match="one MJCF file"):
+        MujocoSimulation(read_scene(tmp_path / "other.yaml"))
