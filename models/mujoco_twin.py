@@ -190,13 +190,15 @@ class MujocoTwin:
         m, writer = self._writer.m, self._writer
         for g in np.flatnonzero(m.geom_contype | m.geom_conaffinity):
             of.setdefault(writer.body_of(int(g)), []).append(int(g))
-        for e in effects:
-            if e.kind != FRICTION:
-                continue
-            for at in e.at:
+        pairs: dict[tuple[int, int], float] = {}
+        for e in effects:  # The last one counts.
+            for at in e.at if e.kind == FRICTION else ():
                 a, b = (name.partition(".")[2] for name in at.split("~"))
-                for one, other in product(of.get(a, ()), of.get(b, ())):
-                    _add_pair(spec, m, writer, one, other, e.parameters["friction"])
+                for pair in product(of.get(a, ()), of.get(b, ())):
+                    one, other = sorted(pair)
+                    pairs[one, other] = e.parameters["friction"]
+        for (one, other), friction in pairs.items():
+            _add_pair(spec, m, writer, one, other, friction)
 
     def _set_drives(self, spec, loaded: LoadedScene, effects: Sequence[Effect]):
         act, plant = loaded.scene.actuation, loaded.plant

@@ -25,7 +25,7 @@ FILE = """
 <actuator><position joint="px" kp="{kp}" kv="30" forcerange="-40 40"/></actuator>
 </mujoco>"""
 PLAIN = {
-    "floor": 0.3, "wall": 0.4, "damping": 8.0, "rotor": 0.1, "dry": 0.2, "tip": 0.3,
+    "floor": 0.4, "wall": 0.4, "damping": 8.0, "rotor": 0.1, "dry": 0.2, "tip": 0.3,
     "size": 0.06, "mass": 0.6, "kp": 600.0,
 }  # fmt: skip
 START = [0.0, 0.12, 0.01, 0.04, 1.0, 0.0, 0.0, 0.0]
@@ -51,6 +51,8 @@ def simulated(folder, *effects: Effect) -> np.ndarray:
     (folder / "scene.yaml").write_text(
         "directives:\n- add_model: {name: w, file: w.xml}\n"
         "actuation: {type: servo, joints: [w.px], kp: [600], kd: [30], limit: [40]}\n"
+        "effects:\n- {kind: contact_friction, at: w.box~w.floor, parameters: "
+        "{friction: 0.4}}\n"
     )
     simulation = MujocoSimulation(read_scene(folder / "scene.yaml"))
     simulation.set_effects([*simulation.scene.effects, *effects])

@@ -15,7 +15,7 @@ import numpy as np
 from makebreak.gap.data.findings import Finding
 from makebreak.gap.data.recording import Recording
 from makebreak.gap.does_not_fit import DoesNotFit
-from makebreak.gap.problem import Candidate, Fitted, Nuisances, SearchPlan
+from makebreak.gap.problem import Candidate, Fitted, Nuisances, SearchPlan, rms
 from makebreak.gap.residuals.impacts import candidates_of, kinds_of_joints, tried
 from makebreak.gap.residuals.objects import MOST_EFFECTS, WindowedProblem
 from makebreak.gap.simulation.mujoco_simulation import MujocoSimulation
@@ -28,11 +28,15 @@ from makebreak.models.scene import Scene
 WINDOW_SEC, MOST = 0.6, 60
 # Variance between two runs whose contacts chatter by chance, over that of what is bent.
 CHANCE = 1.33
+# Of a row, by which commands may act before it; and the error with that, to be so.
+LATE, LESS = (-1.25, -1.0, -0.75, -0.5, -0.25, 0.0), 0.97
+# In which a calm start is looked for, if so much of a window is left.
+CALM_SEC, LEAST = 0.3, 0.65
 PART_SEC = 0.1  # Of a window, where parts are held out.
 # Of how far a parameter is from the scene: where the sum of squares is asked.
 ASIDE = (-0.4, -0.2, -0.1, -0.05, 0.0, 0.05, 0.1, 0.2, 0.4)
 UNEVEN = 0.5  # What is held out must have so much of the error.
-BLUR = 0.002  # Of how far a channel goes: where steps fall between rows is not known.
+BLUR = 5e-4  # Of how far a channel goes: where steps fall between rows is not known.
 
 
 class MujocoProblem(WindowModel, WindowedProblem):
@@ -46,7 +50,15 @@ class MujocoProblem(WindowModel, WindowedProblem):
         jumps=True, loud=UNEXPLAINED_RMS,
     )  # fmt: skip
 
-    def __init__(self, scene: Scene, recordings: Sequence[Recording]):
+    def __init__(
+        self,
+        scene: Scene,
+        recordings: Sequence[Recording],
+        commands_late: float | None = None,
+    ):
+        """Args: commands_late: by how much later than their rows commands act [s];
+        None: it is asked of these recordings, within a row.
+        """
         super().__init__(
             scene, recordings, WINDOW_SEC, most=MOST,
             simulation=MujocoSimulation(scene),
@@ -57,7 +69,36 @@ class MujocoProblem(WindowModel, WindowedProblem):
         self._weighed_by: tuple = ()
         self._in_parts = False
         self._weigh(())
+        if commands_late is None:
+            commands_late = self._late()
+        if commands_late:
+            self.set_commands_late(commands_late)
+            self._weigh(())
         self._share_out()
+
+    def _best_start(self, time, states, row: int) -> int:
+        """The calmest row soon after: amid a push that sets in a smoothed state is a
+        mean of those before and after."""
+        rows = np.flatnonzero((time >= time[row]) & (time < time[row] + CALM_SEC))
+        rows = rows[time[-1] - time[rows] > LEAST * self.window_sec]
+        pace = np.zeros(len(rows))
+        for x in states.values():
+            pace += x[rows, 2] ** 2 / max(float(np.mean(x[:, 2] ** 2)), 1e-12)
+        return int(rows[np.argmin(pace)]) if len(rows) else row
+
+    def _late(self) -> float:
+        """A loop that writes its row after a step writes what acted since the step, and
+        changes what acts between two rows."""
+        if not any(map(self._commanded, self.recordings)):
+            return 0.0
+        row = min(recording.period_sec() for recording in self.recordings)
+        left = {}
+        for share in LATE:
+            self.set_commands_late(share * row)
+            left[share * row] = rms(self.base())
+        self.set_commands_late(0.0)
+        best = min(left, key=lambda late: left[late])
+        return best if left[best] < LESS * left[0.0] else 0.0
 
     def _share_out(self) -> None:
         """Every third window is held out, of those that differ as much: most of a log
@@ -104,7 +145,7 @@ class MujocoProblem(WindowModel, WindowedProblem):
         return self
 
     def _again(self, recordings: Sequence[Recording]) -> WindowModel:
-        return type(self)(self.scene, recordings)
+        return type(self)(self.scene, recordings, self.commands_late)
 
     def _weigh(self, effects: Sequence[Effect]) -> None:
         """Rows by the covariance that a window's samples have with these effects:
