@@ -63,7 +63,7 @@ from makebreak.gap.residuals.command_times import set_command_times
 from makebreak.gap.residuals.contact_problem import ContactProblem
 from makebreak.gap.residuals.driven import DrivenProblem, is_driven
 from makebreak.gap.residuals.impacts import ImpactProblem, runs_against, without_contact
-from makebreak.gap.residuals.in_mujoco import MujocoProblem, by_mujoco
+from makebreak.gap.residuals.in_mujoco import MujocoProblem, contacts_of_mujoco
 from makebreak.gap.residuals.inverse import LOOPS
 from makebreak.gap.residuals.late_poses import contact_problem
 from makebreak.gap.residuals.lying_on_faces import point_on_face
@@ -279,14 +279,12 @@ def _compared(
     reported = excerpt(reported, REPORTED_SEC, REPORTED_ROWS) if reported else []
     say("preparing motions and windows")
     if meets or not is_mechanism:
-        result = budget.if_time(
-            "simulating windows with MuJoCo",
-            partial(_in_mujoco, scene, decided, reported, [*checks, *done], jobs, say),
-            None,
-        )
+        ask = partial(_in_mujoco, scene, decided, reported, [*checks, *done], jobs, say)
+        with budget.share(2).running() as own:
+            by_mujoco = own.if_time("simulating windows with MuJoCo", ask, None)
         seconds["MuJoCo"] = clock.lap()
-        if result is not None:
-            return unless_doubtful(result).with_seconds(seconds)
+        if by_mujoco is not None:
+            return unless_doubtful(by_mujoco).with_seconds(seconds)
         say("preparing motions and windows")
     if is_mechanism and not meets:
         scene = without_shapes(scene)
@@ -539,7 +537,7 @@ def _in_mujoco(
     say("searching the catalogue in MuJoCo")
     selection = select(problem, say)
     with present().part(CONCLUDE):
-        found = [*checks, by_mujoco(problem)]
+        found = [*checks, contacts_of_mujoco(problem)]
         result = conclude(problem, selection, reported, found, jobs)
     return result if result.verdict in ("no_gap", "gap_named", "ambiguous") else None
 

@@ -397,6 +397,7 @@ class _Writer:
         return f"{name}_fixed" if name in taken else name
 
     def body_of(self, geom: int) -> str:
+        """The name of the body that has a shape."""
         body = int(self.m.geom_bodyid[geom])
         return self.name_of("body", body) if body else self._fixed(geom)
 

@@ -311,6 +311,7 @@ class JointNumbers:
 
 
 def joint_numbers(loaded: LoadedScene, joint: Joint) -> JointNumbers:
+    """What a joint and its drive do in a scene."""
     plant, name = loaded.plant, full_name(loaded.plant, joint)
     actuation, actuator = loaded.scene.actuation, actuator_of(plant, joint)
     law = law_of(actuation, name)

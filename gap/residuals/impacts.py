@@ -604,7 +604,10 @@ def kinds_of_joints(model: WindowModel):
         speed = float(np.sqrt(np.mean(x[:, 1] ** 2))) or 1e-3
         effort = float(M[i] * np.median(np.abs(x[:, 2]))) or 1e-3
         for kind, entry in KINDS.items():
-            if entry.at not in ("joint", "actuator") or len(entry.parameters) != 1:
+            if (
+                entry.at not in ("joint", "actuator", "drive")
+                or len(entry.parameters) != 1
+            ):
                 continue
             if at not in dynamics.places(kind) or entry.hidden_state:
                 continue
@@ -612,13 +615,14 @@ def kinds_of_joints(model: WindowModel):
             now = dynamics.now(kind, [at]).get(p.name, 0.0)
             step = {
                 "N m": SMALL * effort,
+                "N m/rad": 0.1 * now,
                 "N m s/rad": SMALL * effort / speed,
                 "N m s2/rad2": SMALL * effort / speed**2,
                 "kg m2": 0.1 * float(M[i]),
                 "s": 0.002,
                 "": 0.05,
             }.get(p.unit)
-            if step is not None and abs(now) < 1e20:
+            if step and abs(now) < 1e20:
                 yield kind, at, p.name, [(step, now + step)]
 
 

@@ -6,7 +6,7 @@ in a window: noise, what an uncertain start does, which goes together throughout
 what contacts that chatter do by chance.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 
@@ -60,7 +60,7 @@ class MujocoProblem(WindowModel, WindowedProblem):
         None: it is asked of these recordings, within a row.
         """
         super().__init__(
-            scene, recordings, WINDOW_SEC, most=MOST,
+            scene, recordings, WINDOW_SEC, WINDOW_SEC - CALM_SEC, most=MOST,
             simulation=MujocoSimulation(scene),
         )  # fmt: skip
         if any(map(self._by_measured, self.recordings)):
@@ -70,8 +70,8 @@ class MujocoProblem(WindowModel, WindowedProblem):
         self._in_parts = False
         self._weigh(())
         if commands_late is None:
-            commands_late = self._late()
-        if commands_late:
+            self._set_late(())
+        else:
             self.set_commands_late(commands_late)
             self._weigh(())
         self._share_out()
@@ -86,19 +86,24 @@ class MujocoProblem(WindowModel, WindowedProblem):
             pace += x[rows, 2] ** 2 / max(float(np.mean(x[:, 2] ** 2)), 1e-12)
         return int(rows[np.argmin(pace)]) if len(rows) else row
 
-    def _late(self) -> float:
+    def _row_sec(self) -> float:
+        return min(recording.period_sec() for recording in self.recordings)
+
+    def _set_late(self, effects: Sequence[Effect]) -> None:
         """A loop that writes its row after a step writes what acted since the step, and
         changes what acts between two rows."""
         if not any(map(self._commanded, self.recordings)):
-            return 0.0
-        row = min(recording.period_sec() for recording in self.recordings)
+            return
+        row, now = self._row_sec(), self.commands_late
         left = {}
         for share in LATE:
             self.set_commands_late(share * row)
-            left[share * row] = rms(self.base())
-        self.set_commands_late(0.0)
+            left[share * row] = rms(self.residual(effects))
         best = min(left, key=lambda late: left[late])
-        return best if left[best] < LESS * left[0.0] else 0.0
+        best = best if left[best] < LESS * left[0.0] else 0.0
+        self.set_commands_late(best)
+        if best != now:
+            self._weigh(effects)
 
     def _share_out(self) -> None:
         """Every third window is held out, of those that differ as much: most of a log
@@ -114,6 +119,7 @@ class MujocoProblem(WindowModel, WindowedProblem):
         self._in_parts = bool(held < UNEVEN * off[train].mean())
 
     def train(self) -> np.ndarray:
+        """(m,) which rows are fitted."""
         if not self._in_parts:
             return super().train()
         part = [
@@ -136,7 +142,7 @@ class MujocoProblem(WindowModel, WindowedProblem):
         return f"{name} from {w.start:.3g} to {end:.3g} s", float(np.sqrt(off[k]))
 
     @property
-    def met(self) -> dict[tuple[str, str], float]:
+    def met(self) -> Mapping[tuple[str, str], float]:
         """Of everything that is fixed it is asked along each axis."""
         places = self.dynamics.places(PLACE)
         return {(at, axis): 0.0 for at in places for axis in "xyz"}
@@ -184,6 +190,7 @@ class MujocoProblem(WindowModel, WindowedProblem):
             self.windows[k] = replace(w, std=wide)
 
     def residual(self, effects: Sequence[Effect] = ()) -> np.ndarray:
+        """(m,) over the covariance of each window."""
         simulated = self.simulate(effects)
         each = []
         for e, (A, less) in zip(
@@ -194,11 +201,13 @@ class MujocoProblem(WindowModel, WindowedProblem):
         return np.concatenate(each)[self.measured()]
 
     def reweigh(self, fitted: Fitted) -> bool:
+        """Once for each set of kinds that is fitted; and asks when commands act."""
         key = tuple(e.kind for e in fitted.effects)
         if self._weighed_by == key:
             return False
         self._weighed_by = key
         self._weigh(fitted.effects)
+        self._set_late(fitted.effects)
         return True
 
     def widened(self, end: Fitted, k: int) -> tuple[dict[str, float], tuple[str, ...]]:
@@ -211,14 +220,14 @@ class MujocoProblem(WindowModel, WindowedProblem):
         for name, value in effect.parameters.items():
             reach = abs(value - now.get(name, 0.0))
             steps = reach * np.array(ASIDE)
-            left = [
+            square = [
                 self._try_at(end, k, name, float(value + step), calm)
                 for step in steps if name in std and reach > 0.0
             ]  # fmt: skip
-            good = np.isfinite(left)
+            good = np.isfinite(square)
             if good.sum() < 5:
                 continue
-            d, left = steps[good], np.array(left)[good]
+            d, left = steps[good], np.array(square)[good]
             fit = np.polyfit(d, left, 2)
             off = left - np.polyval(fit, d)
             rough = float(np.sqrt(np.sum(off**2) / (len(d) - 3)))
@@ -253,7 +262,7 @@ def _moved(w: Window, name: str, k: int, sign: float) -> Window:
     return replace(w, state={**w.state, name: x})
 
 
-def by_mujoco(problem: MujocoProblem) -> Finding:
+def contacts_of_mujoco(problem: MujocoProblem) -> Finding:
     """That another simulator's contact was compared."""
     says = (
         f"Windows of {WINDOW_SEC:g} s were simulated by MuJoCo, with the contacts and "

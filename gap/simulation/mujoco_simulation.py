@@ -28,11 +28,13 @@ class MujocoSimulation(SceneSimulation):
         self.set_effects(scene.effects)
 
     def set_effects(self, effects: Sequence[Effect]) -> None:
+        """The scene's effects from now on. Raises: ValueError as MujocoTwin."""
         self._twin = self._twins.with_effects(effects)
         self._current = tuple(effects)
         self._commands.set_effects(self._current)
 
     def channels(self) -> list[str]:
+        """The measured channels that are simulated: no efforts."""
         return [c for c in super().channels() if not self._channels.is_effort(c)]
 
     def _simulate(

@@ -169,8 +169,6 @@ class WindowModel(WindowedResidual):
 
     commands_late = 0.0
     rows_sec = 0.0  # Rows closer than this are left out.
-    # {(fixed body, axis of the world): where it is met}, where that is asked.
-    met: Mapping[tuple[str, str], float] = {}
 
     def __init__(
         self,
@@ -246,6 +244,11 @@ class WindowModel(WindowedResidual):
             )
         self._commands: dict[tuple, list[dict[int, Commands]]] = {}
         self.runs = 0
+
+    @property
+    def met(self) -> Mapping[tuple[str, str], float]:
+        """{(fixed body, axis of the world): where it is met}, where that is asked."""
+        return {}
 
     def set_commands_late(self, seconds: float) -> None:
         """By how much later than their rows commands act from now on [s]."""
