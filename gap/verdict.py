@@ -49,9 +49,9 @@ def in_plain_units(gap: GapMeasure) -> str:
         return ""
     name = max(known, key=lambda n: gap.per_channel[n]["before"])
     e = known[name]
-    goes = plain(e.before, e.unit)
-    if e.after != e.before and isfinite(e.after):
-        goes = f"from {goes} to {plain(e.after, e.unit)}"
+    goes, to = plain(e.before, e.unit), plain(e.after, e.unit)
+    if to != goes and isfinite(e.after):
+        goes = f"from {goes} to {to}"
     return (
         f" ({name}: {goes}; expected from noise and uncertain start: "
         f"{plain(e.expected, e.unit)})"
@@ -367,10 +367,12 @@ def says(
     tail = ""
     if verdict == "ambiguous":
         tail = _apart_from(effects)
-    goes = "falls" if gap.after < gap.before else "goes"
+    goes = f"{'falls' if gap.after < gap.before else 'goes'} from {before} to {after}"
+    if before == after:
+        goes = f"stays at {after}"
     return (
-        f"{words}{tail} The held-out error {goes} from {before} to {after} times the "
-        f"expected error{in_plain_units(gap)}.{more}"
+        f"{words}{tail} The held-out error {goes} times the expected error"
+        f"{in_plain_units(gap)}.{more}"
     )
 
 

@@ -114,6 +114,7 @@ class MujocoTwin:
                 biastype=mujoco.mjtBias.mjBIAS_AFFINE,
             )  # fmt: skip
             drive.gainprm[0] = 1.0
+            drive.ctrllimited = 0  # Whatever the file's default is.
 
     def with_effects(self, effects: Sequence[Effect]) -> Twin:
         """Args: effects: all of the scene's; those of sensors do not count.

@@ -13,7 +13,8 @@ from makebreak.models.scene import InitialSection, read_scene  # noqa: E402
 
 FILE = """
 <mujoco model="w"><option timestep="0.001" integrator="implicitfast"/>
-<default><geom condim="4"/></default><worldbody>
+<default><geom condim="4"/><position ctrlrange="-1 1"/><general ctrlrange="-1 1"/>
+</default><worldbody>
 <geom name="floor" type="plane" size="3 3 .1" friction="{floor}"/>
 <geom name="wall" type="box" size=".02 .5 .2" pos="{wall} 0 .2" euler="0 0 10"/>
 <body name="pusher" pos="0 0 .05"><joint name="px" type="slide" axis="1 0 0"

@@ -22,6 +22,7 @@ class MujocoSimulation(SceneSimulation):
     def __init__(self, scene: Scene):
         try:
             self._twins = MujocoTwin(scene)
+            self._twins.with_effects(scene.effects)
         except ValueError as error:
             raise DoesNotFit(str(error)) from None
         super().__init__(scene)
