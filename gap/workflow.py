@@ -278,7 +278,7 @@ def _compared(
     decided, reported, done = _conditioned(parts, dynamics, is_mechanism and not meets)
     reported = excerpt(reported, REPORTED_SEC, REPORTED_ROWS) if reported else []
     say("preparing motions and windows")
-    if meets or not is_mechanism:
+    if not is_mechanism:
         ask = partial(_in_mujoco, scene, decided, reported, [*checks, *done], jobs, say)
         with budget.share(2).running() as own:
             by_mujoco = own.if_time("simulating windows with MuJoCo", ask, None)
@@ -498,6 +498,7 @@ def equations_of(
 ) -> tuple[MechanismProblem, list[Finding]]:
     """A mechanism's equations of motion, as problem_for."""
     recordings, touches = without_contact(dynamics, recordings)
+    scene = without_shapes(scene)  # Nor do windows know of contact.
     scene, finding = _settle_step(scene, recordings, dynamics, jobs)
     mechanism = MechanismProblem(scene, recordings)
     return mechanism, [*touches, *finding, *mechanism.push_findings()]
