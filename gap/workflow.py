@@ -60,6 +60,7 @@ from makebreak.gap.problem import (
 from makebreak.gap.report.clock import zero_of
 from makebreak.gap.report.summary import says_of
 from makebreak.gap.residuals.command_times import set_command_times
+from makebreak.gap.residuals.contact_means import SLIDES
 from makebreak.gap.residuals.contact_problem import ContactProblem
 from makebreak.gap.residuals.driven import DrivenProblem, is_driven
 from makebreak.gap.residuals.impacts import ImpactProblem, runs_against, without_contact
@@ -133,6 +134,9 @@ MOST_SEC, MOST_ROWS = 60.0, 120_000
 # Windows that tell how far a step errs: where that decides which one is taken, and
 # where it is only said.
 ASKED, TOLD_BY = 24, 8
+# Slip of soft contacts that hold [m/s]: MuJoCo's friction stops what moves within a
+# hundredth of a second, of what its weight presses down by 0.5 to 1 of that.
+CREEP = 0.1
 # Of what is only reported on.
 REPORTED_SEC, REPORTED_ROWS = 20.0, 40_000
 
@@ -335,6 +339,22 @@ def _compared(
         searched.undone[:] = own.undone
         return other, then, named
 
+    def with_creep() -> tuple[GapProblem, Selection, GapResult]:
+        """Where friction holds softly: what creeps is no slip."""
+        pressing = isinstance(problem, PressingProblem)
+        made = _pressing_problem if pressing else _contact_problem
+        say("preparing contacts that creep")
+        other, found = made(scene, decided, CREEP)
+        if other.rich_left > AGREEMENT_RMS_MAX:  # Nor does all that is ordinary then.
+            return problem, selection, result
+        say("searching the catalogue with contacts that creep")
+        then = select(other, say)
+        with budget.part(CONCLUDE):
+            named = conclude(other, then, reported, [*checks, *found, creep()], jobs)
+        if named.verdict in ("gap_unnamed", "not_judged"):
+            return problem, selection, result
+        return other, then, named
+
     def between_impacts(problem: FlightProblem) -> GapResult:
         between = problem.between_impacts() if unnamed else None
         if between is None:
@@ -370,6 +390,11 @@ def _compared(
         )
         seconds["impacts"] = clock.lap()
     again: ProblemOf = partial(problem_for, meets=meets)
+    touching = isinstance(problem, ContactProblem)
+    if result.verdict == "gap_unnamed" and touching:
+        what, now = "comparing with contacts that creep", (problem, selection, result)
+        problem, selection, result = budget.if_time(what, with_creep, now)
+        seconds["creep"] = clock.lap()
     if result.verdict == "gap_unnamed" and is_driven(scene, decided):
         was, what = problem, "comparing in another way"
         problem, selection, result = budget.if_time(
@@ -519,10 +544,21 @@ def other_problem(
 
 
 def _contact_problem(
-    scene: Scene, recordings: Sequence[Recording]
+    scene: Scene, recordings: Sequence[Recording], slides: float = SLIDES
 ) -> tuple[ContactProblem, list[Finding]]:
-    contact = contact_problem(scene, recordings)
+    contact = contact_problem(scene, recordings, slides=slides)
     return contact, sap_lift(contact) + point_on_face(contact, contact.lying())
+
+
+def creep() -> Finding:
+    """What is said where contacts that creep explain what others do not."""
+    says = (
+        f"Contacts that slip slower than {CREEP:g} m/s press back with less friction "
+        "than they could, as soft contacts of a simulator do that creep (MuJoCo's, "
+        "say): there any friction up to its limit was allowed. Slow slip says nothing "
+        "of a friction that is smaller than the model's."
+    )
+    return Finding("contacts_creep", "", "time", CREEP, "m/s", "warning", says)
 
 
 def _in_mujoco(
@@ -543,8 +579,10 @@ def _in_mujoco(
     return result if result.verdict in ("no_gap", "gap_named", "ambiguous") else None
 
 
-def _pressing_problem(scene: Scene, recordings: Sequence[Recording]):
-    pressing = PressingProblem(scene, recordings)
+def _pressing_problem(
+    scene: Scene, recordings: Sequence[Recording], slides: float = SLIDES
+):
+    pressing = PressingProblem(scene, recordings, slides=slides)
     return pressing, point_on_face(pressing, pressing.lying())
 
 

@@ -79,6 +79,7 @@ def outcomes(monkeypatch, error):
     )
     problem = SimpleNamespace(
         scene=None,
+        slides=0.0,
         recordings=[],
         tracks=[],
         _windows=None,

@@ -82,7 +82,7 @@ def test_what_sensors_feel_is_taken_off_unseen_recordings_too(pushes):
     problem, _, _, _, unseen = pushes
     places = tuple(s.place for s in problem.sensors)
     assert places
-    known = {"allowance": problem.allowance}
+    known = {"allowance": problem.allowance, "slides": problem.slides}
     asked = SimpleNamespace(_feel_motion=places, **known)
     plain = SimpleNamespace(_feel_motion=(), **known)
     felt, other = (ContactProblem(problem.scene, unseen, x) for x in (asked, plain))

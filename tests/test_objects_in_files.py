@@ -11,8 +11,11 @@ from makebreak.gap.data.coordinates import by_lists
 from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.data.robot import Log, propose_scene, read_robot
 from makebreak.gap.data.table import RecordingTable
+from makebreak.gap.residuals.contact_problem import ContactProblem
+from makebreak.gap.thresholds import AGREEMENT_RMS_MAX
 from makebreak.gap.workflow import run_gap
 from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import read_scene
 
 mujoco = pytest.importorskip("mujoco", reason="MuJoCo has no wheels for Python 3.10")
@@ -242,6 +245,22 @@ def pushed(folder, mass: float, cone: str):
     # Efforts hold what the box pushes back with: they are not the motion's alone.
     assert not found.said
     return read_scene(folder / "scene.yaml"), read_recordings([folder / "log.npz"])
+
+
+def test_contacts_that_creep_are_no_other_mass(tmp_path):
+    """MuJoCo's friction is soft: what is held slips by centimetres a second. Taken for
+    sliding, it tells of other masses; taken for what may hold, of the true one."""
+    scene, recordings = pushed(tmp_path, 0.6, "elliptic")
+    left = {}
+    for slides in (0.01, 0.1):
+        problem = ContactProblem(scene, recordings, slides=slides)
+        true = [Effect("object_mass", ["w.box"], {"mass": 0.9})]
+        left[slides] = [
+            float(np.sqrt(np.mean(problem.residual(each) ** 2))) for each in ((), true)
+        ]
+
+    assert left[0.1][1] < AGREEMENT_RMS_MAX < left[0.01][1]
+    assert left[0.1][1] < 0.7 * left[0.1][0]
 
 
 def test_friction_of_a_pair_is_mujocos(tmp_path):

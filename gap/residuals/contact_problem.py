@@ -26,6 +26,7 @@ from makebreak.gap.problem import (
 )
 from makebreak.gap.residuals.contact_candidates import ContactCandidates
 from makebreak.gap.residuals.contact_dynamics import OF_ROBOTS, WRENCHED
+from makebreak.gap.residuals.contact_means import SLIDES
 from makebreak.gap.residuals.lying_on_faces import lying_on_faces
 from makebreak.gap.residuals.mechanism import link_changes
 from makebreak.gap.residuals.mechanism_candidates import tolerances
@@ -56,6 +57,7 @@ from makebreak.gap.simulation.measure import (
 )
 from makebreak.gap.thresholds import AGREEMENT_RMS_MAX
 from makebreak.models.effects import KINDS
+from makebreak.models.effects.contact_damper import STICTION
 from makebreak.models.effects.kind import Effect, sliding_joints
 from makebreak.models.effects.objects import MASS
 from makebreak.models.scene import Scene
@@ -99,11 +101,15 @@ class ContactProblem(ContactCandidates, GapProblem):
         scene: Scene,
         recordings: Sequence[Recording],
         learned: "ContactProblem | None" = None,
+        slides: float = SLIDES,
     ):
         """Args: learned: a problem of the same scene with other recordings, of which
         stays what models are off by and what sensors feel; None: both are learned of
-        these.
+        these. slides: slower slip [m/s] may be sticking.
         """
+        self.slides = slides if learned is None else learned.slides
+        if self.slides > SLIDES:  # Of contacts that creep laws are less exact.
+            self.plan = replace(self.plan, least_error=AGREEMENT_RMS_MAX)
         self._scalable: dict[str, bool] = {}
         # By how much bodies' poses were moved earlier before this (late_poses.py) [s],
         # and the error before and with that.
@@ -623,10 +629,11 @@ class ContactProblem(ContactCandidates, GapProblem):
         self, effects, start: Fitted, end: Fitted, nuisances: Nuisances,
         recordings=None, jobs: int = 1,
     ) -> Outcome | None:  # fmt: skip
+        creep = self.slides if self.slides > SLIDES else STICTION
         if recordings is not None:
             try:
                 model = PushWindows(
-                    self.scene, recordings, None, self.lying(), self.pressed()
+                    self.scene, recordings, None, self.lying(), self.pressed(), creep
                 )
             except DoesNotFit:  # No window fits in.
                 return None
@@ -641,7 +648,7 @@ class ContactProblem(ContactCandidates, GapProblem):
                 try:
                     self._windows = PushWindows(
                         self.scene, self.recordings, episodes, self.lying(),
-                        self.pressed(),
+                        self.pressed(), creep,
                     )  # fmt: skip
                 except DoesNotFit:
                     return None

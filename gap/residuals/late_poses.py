@@ -11,6 +11,7 @@ from collections.abc import Iterable, Sequence
 from makebreak.gap.data.recording import Recording
 from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.numerics.selection import Screen
+from makebreak.gap.residuals.contact_means import SLIDES
 from makebreak.gap.residuals.contact_problem import BEYOND, MISFIT, ContactProblem
 from makebreak.gap.residuals.pose_times import earlier
 from makebreak.models.scene import Scene
@@ -19,13 +20,16 @@ ROUNDS, MOST_LATE = 6, 0.1  # Of moving poses; later than this is no camera [s].
 NO_WORSE = 1.1  # Of what a model with every effect leaves, what it may leave then.
 
 
-def contact_problem(scene: Scene, recordings: Sequence[Recording]) -> ContactProblem:
+def contact_problem(
+    scene: Scene, recordings: Sequence[Recording], slides: float = SLIDES
+) -> ContactProblem:
     """The problem with poses where they belong in time; `late` says by how much each
     body's were moved.
 
+    Args: slides: as ContactProblem.
     Raises: DoesNotFit as ContactProblem.
     """
-    problem = first = ContactProblem(scene, recordings)
+    problem = first = ContactProblem(scene, recordings, slides=slides)
     late: dict[str, float] = {}
     for _ in range(ROUNDS):
         more = wanted(problem)
@@ -34,7 +38,7 @@ def contact_problem(scene: Scene, recordings: Sequence[Recording]) -> ContactPro
         if not more or max(trial.values()) > MOST_LATE:
             break
         try:
-            other = ContactProblem(scene, earlier(recordings, trial))
+            other = ContactProblem(scene, earlier(recordings, trial), slides=slides)
         except DoesNotFit:  # Too little is left to say so.
             break
         problem, late = other, trial

@@ -85,6 +85,7 @@ class Geometry:
 class PermittedContacts(ContactMeans):
     """Generators of contact forces at the nodes of the test functions."""
 
+    slides = SLIDES  # Slower slip may be sticking [m/s].
     # Kinds that move points and surfaces of what lies or is pushed.
     moves: tuple[str, ...] = ("plane_tilt", "plane_height", PLACE, "object_size")
 
@@ -439,7 +440,7 @@ class PermittedContacts(ContactMeans):
             speed = np.linalg.norm(slip, axis=1)
             # Of what just set in or stopped the smoothed slip is not known.
             off = tangential(np.einsum("nij,nj->ni", J, self._node_v_off), s.normal)
-            sure = speed >= np.maximum(SLIDES, np.linalg.norm(off, axis=1))
+            sure = speed >= np.maximum(self.slides, np.linalg.norm(off, axis=1))
             fast = np.asarray(W @ (sure & mine).astype(float)).ravel()
             slides = fast >= 0.999 * weight  # Slower in any part: it may stick.
             along = slip / np.maximum(speed, 1e-9)[:, None]

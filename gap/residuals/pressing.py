@@ -19,6 +19,7 @@ from makebreak.gap.numerics.runs import runs_of
 from makebreak.gap.numerics.selection import Screen, std_of_shared_errors
 from makebreak.gap.problem import Candidate, Fitted, Nuisances
 from makebreak.gap.residuals.contact_dynamics import THIN
+from makebreak.gap.residuals.contact_means import SLIDES
 from makebreak.gap.residuals.contact_problem import ContactProblem
 from makebreak.gap.residuals.felt_places import AXES, MOVES, SOFT, WHOLE, FeltPlaces
 from makebreak.gap.residuals.fixed_faces import (
@@ -192,6 +193,7 @@ class PressingProblem(FeltPlaces):
         scene: Scene,
         recordings: Sequence[Recording],
         learned: ContactProblem | None = None,
+        slides: float = SLIDES,
     ):
         self._any_friction = False
         self._mu: float | None = None
@@ -199,7 +201,7 @@ class PressingProblem(FeltPlaces):
         self._weighed = 0
         self._pressed_at: tuple[tuple | None, dict] = (None, {})
         self._not_passed: tuple = ()  # Places with which the tool went through nothing.
-        super().__init__(scene, recordings, learned)
+        super().__init__(scene, recordings, learned, slides)
 
     # ----- Rows
 

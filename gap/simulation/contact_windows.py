@@ -32,6 +32,7 @@ from makebreak.gap.simulation.windows import BESIDE, TURN, Window, WindowModel
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.contact import FRICTION
+from makebreak.models.effects.contact_damper import STICTION
 from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
 from makebreak.models.scene import Scene
 from makebreak.models.scene_schema import COMMANDS_OF, ActuationSection
@@ -60,7 +61,8 @@ LED_RATE, LED_SEC = 300.0, 1e-3
 class PushWindows(WindowModel):
     """Args: episodes: (recording, number) of those that count, else all. lying: bodies
     that lie on faces, which are carried by face_supports. pairs: those of which windows
-    expect no friction to be known better than LAW.
+    expect no friction to be known better than LAW. creep: slip of contacts that hold
+    [m/s], where it is more than Drake's.
 
     Raises: DoesNotFit where no window fits in.
     """
@@ -72,8 +74,9 @@ class PushWindows(WindowModel):
         episodes: set[tuple[int, int]] | None = None,
         lying: Sequence[LiesOn] = (),
         pairs: Sequence[str] = (),
+        creep: float = STICTION,
     ):
-        self._only, self._pairs = episodes, tuple(pairs)
+        self._only, self._pairs, self._creep = episodes, tuple(pairs), creep
         self._draw: np.random.Generator | None = None  # Of efforts, while it is there.
         scene, led = led_as_measured(scene, recordings)
         self._led = led
@@ -281,7 +284,8 @@ class PushWindows(WindowModel):
         noise of measured efforts, and frictions that are off by LAW: an arm that pushes
         along a wall may stick or slip by them, and where it does not hold itself a
         little becomes much. What dry friction holds creeps by its law, as fast as it
-        fades below, and nowhere else: twice as fast it goes twice as far."""
+        fades below, and nowhere else: twice as fast it goes twice as far. A contact
+        that creeps, if any does, may creep or not."""
         rng = np.random.default_rng(0)
         plain = self.simulate(effects)
         wide = [np.zeros_like(y) for y in plain]
@@ -310,6 +314,12 @@ class PushWindows(WindowModel):
                 add(self.simulate(effects), 1.0)
             finally:
                 self.simulation.fades = 1.0
+        if self._creep > STICTION:
+            self.simulation.creeps = self._creep
+            try:
+                add(self.simulate(effects), 1.0)
+            finally:
+                self.simulation.creeps = STICTION
         for by in (LAW, -LAW) if self._pairs else ():
             add(self.simulate(self._with_frictions(effects, 1.0 + by)), 0.5)
         return plain, wide

@@ -25,6 +25,7 @@ from makebreak.gap.simulation.sensor_samples import (
 )
 from makebreak.gap.simulation.stand_on_ground import stand_on_ground
 from makebreak.models.effects import KINDS
+from makebreak.models.effects.contact_damper import STICTION
 from makebreak.models.effects.kind import Effect
 from makebreak.models.effects.measured_channels import ChannelMap, channel_maps
 from makebreak.models.scene import CHANNEL_STEPS, InitialSection, Scene, read_scene
@@ -67,6 +68,8 @@ class SceneSimulation:
         self._config = config or SimulationConfig()
         self.builds = 0
         self.fades = 1.0  # Times the speeds below which dry friction fades.
+        # Slip below which contacts that hold creep [m/s]: Drake's own.
+        self.creeps = STICTION
         self.failure = ""  # Why the last run stopped short, if it did.
         self._current: tuple[Effect, ...] = ()
         self._build()
@@ -94,6 +97,7 @@ class SceneSimulation:
             raise
         self._current = tuple(ranked)
         self._commands.set_effects(self._current)
+        self._plant.set_stiction_tolerance(self.creeps)
         forces = self._loaded.joint_forces
         if forces is not None and self.fades != 1.0:
             forces.fade_below(self._context, self.fades)
