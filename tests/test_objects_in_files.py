@@ -302,3 +302,40 @@ def test_what_hangs_nobody_knows_where_touches_nothing(tmp_path):
         PARTS, np.tile([0, 0, 0.1, 1, 0, 0, 0], (N, 1)).T, strict=True)}  # fmt: skip
     scene, _, _ = proposed(tmp_path, mjcf(leg), columns | pose_of_trunk)
     assert "overlap" not in scene
+
+
+def test_a_ball_of_another_size_is_named_by_windows_of_mujoco(tmp_path):
+    """It is thrown against a wall and rolls back; contacts give way by 0.3 mm."""
+    text = (
+        '<mujoco model="w"><worldbody><geom name="floor" type="plane" size="3 3 .1"/>'
+        '<geom name="back" type="box" size=".02 1 .3" pos=".8 0 .3"/>'
+        '<body name="ball" pos="0 0 .4"><freejoint/><geom type="sphere" size="{}" '
+        'mass=".06" condim="4"/></body></worldbody></mujoco>'
+    )
+    model = mujoco.MjModel.from_xml_string(text.format(0.034))
+    data = mujoco.MjData(model)
+    data.qpos[:3], data.qvel[:3] = [-0.5, 0.0, 0.5], [1.2, 0.1, 0.0]
+    rows = []
+    for step in range(2000):
+        mujoco.mj_step(model, data)
+        if step % 2 == 0:
+            rows.append([data.time, *data.qpos])
+    table = np.array(rows)
+    table[:, 1:] += 4e-4 * np.random.default_rng(3).normal(size=(len(table), 7))
+    np.savez(tmp_path / "log.npz", time=table[:, 0], qpos=table[:, 1:])
+    (tmp_path / "w.xml").write_text(text.format(0.03))
+    read = RecordingTable(
+        {"time": table[:, 0]} | {f"qpos[{k}]": table[:, 1 + k] for k in range(7)},
+        np.arange(len(table)) + 1,
+        len(table),
+    )
+    log = Log(tmp_path / "log.npz", read)
+    found = propose_scene(read_robot(tmp_path / "w.xml"), [log])
+    (tmp_path / "scene.yaml").write_text(found.scene)
+    (tmp_path / "log.yaml").write_text(found.sidecars[tmp_path / "log.npz"])
+    result = run_gap(tmp_path / "scene.yaml", [tmp_path / "log.npz"])
+    assert result.verdict == "gap_named", result.says
+    (named,) = result.effects
+    assert (named.kind, list(named.at)) == ("object_size", ["w.ball"])
+    assert named.parameters["radius"] == pytest.approx(0.034, abs=1e-4)
+    assert "mujoco_contacts" in {check.kind for check in result.checks}

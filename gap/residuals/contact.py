@@ -43,6 +43,7 @@ _POSITIVE = dict.fromkeys(
      "izz"), True,
 )  # fmt: skip
 _SIZES = (0.95, 0.99, 1.05)
+_FAR_SIZES = (0.87, 1.15)  # Where what is off by so much is off at once.
 _DAMPED = (0.02, 0.06, 0.12, 0.25, 0.5)  # Of critical damping: a linear damper's.
 _INERTIAS = (0.97, 1.2)
 PLACES = (-0.02, -0.008, -0.003, 0.003, 0.008, 0.02)  # Of a face that is met [m].
@@ -161,7 +162,8 @@ def _trials(model, kind: str, at: str):
         return
     if kind == "object_size":
         name = "radius" if "radius" in now else "scale"
-        values = [now[name] * s for s in _SIZES]
+        far = () if isinstance(model, FreeBodyModel) else _FAR_SIZES
+        values = [now[name] * s for s in (*_SIZES, *far)]
         yield [[(v - now[name], {name: v})] for v in values], (name,), ()
     elif kind == "length_scale":
         yield [[(s, {"scale": 1.0 + s})] for s in (-0.02, 0.02)], ("scale",), ()

@@ -46,7 +46,7 @@ class MujocoProblem(WindowModel, WindowedProblem):
     """
 
     plan = SearchPlan(
-        evaluations=10, diff_step=0.02, least_gain=0.05, most_effects=MOST_EFFECTS,
+        evaluations=10, diff_step=5e-3, least_gain=0.05, most_effects=MOST_EFFECTS,
         jumps=True, loud=UNEXPLAINED_RMS,
     )  # fmt: skip
 
