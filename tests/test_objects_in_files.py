@@ -337,5 +337,5 @@ def test_a_ball_of_another_size_is_named_by_windows_of_mujoco(tmp_path):
     assert result.verdict == "gap_named", result.says
     (named,) = result.effects
     assert (named.kind, list(named.at)) == ("object_size", ["w.ball"])
-    assert named.parameters["radius"] == pytest.approx(0.034, abs=1e-4)
+    assert named.parameters["radius"].value == pytest.approx(0.034, abs=1e-4)
     assert "mujoco_contacts" in {check.kind for check in result.checks}
