@@ -290,7 +290,7 @@ class _Writer:
             pos, quat = q[:3], q[3:] / np.linalg.norm(q[3:])
         # X_PB at positions of 0, and the joints of the body as they then are. MuJoCo
         # turns a body by each of its joints in turn, from its reference position.
-        R = _rotation(quat)
+        R = rotation(quat)
         links: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
         for j in joints:
             X, p = np.eye(3), np.zeros(3)
@@ -323,7 +323,7 @@ class _Writer:
             )  # fmt: skip
             for j in joints:
                 self._joint(j, at)
-        about = _rotation(m.body_iquat[i])
+        about = rotation(m.body_iquat[i])
         central = about @ np.diag(m.body_inertia[i]) @ about.T
         six = central[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
         if m.body_mass[i]:
@@ -602,7 +602,7 @@ class _Writer:
             self.notes.append("the wind is left out")
 
 
-def _rotation(quat: Sequence[float] | np.ndarray) -> np.ndarray:
+def rotation(quat: Sequence[float] | np.ndarray) -> np.ndarray:
     """(3, 3) of a quaternion w x y z."""
     w, x, y, z = np.asarray(quat, float) / np.linalg.norm(quat)
     return np.array([
@@ -624,4 +624,4 @@ def _quaternion(R: np.ndarray) -> np.ndarray:
 
 
 def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
-    return _rotation([np.cos(angle / 2), *(np.sin(angle / 2) * axis)])
+    return rotation([np.cos(angle / 2), *(np.sin(angle / 2) * axis)])

@@ -14,7 +14,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydrake.geometry import Box, Capsule, Cylinder, Ellipsoid, Shape, Sphere
+from pydrake.geometry import (
+    Box,
+    Capsule,
+    Convex,
+    Cylinder,
+    Ellipsoid,
+    Mesh,
+    Shape,
+    Sphere,
+)
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.parsing import PackageMap
 from pydrake.multibody.plant import MultibodyPlant
@@ -34,7 +43,7 @@ from makebreak.models.effects.actuation_path import (
 )
 from makebreak.models.effects.contact import CONTACT_LAW, FRICTION
 from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
-from makebreak.models.mjcf import named_spec
+from makebreak.models.mjcf import named_spec, rotation
 from makebreak.models.model_export import inertial_of, joint_numbers, payloads_of
 from makebreak.models.model_files import with_what_files_say
 from makebreak.models.robot_file import path_of
@@ -48,14 +57,13 @@ MOST_KEPT = 32  # Models.
 class Twin:
     """model: MjModel. q (n_q,), v (n_v,): where Drake's coordinates are in qpos, qvel.
     spins: of each free body where its spin is in Drake's v, and its quaternion in q.
-    commands: {command channel: (entry of ctrl, factor)}; delays: {channel: [s]}."""
+    commands: {command channel: (entry of ctrl, factor)}."""
 
     model: Any
     q: np.ndarray
     v: np.ndarray
     spins: tuple[tuple[int, int], ...]
     commands: dict[str, tuple[int, float]]
-    delays: dict[str, float]
 
 
 class MujocoTwin:
@@ -151,8 +159,8 @@ class MujocoTwin:
         self._set_inertias(spec, now)
         self._set_shapes(spec, now)
         self._set_pairs(spec, effects)
-        commands, delays = self._set_drives(spec, now.loaded, effects)
-        return _indexed(spec.compile(), now.loaded.plant, commands, delays)
+        commands = self._set_drives(spec, now.loaded, effects)
+        return _indexed(spec.compile(), now.loaded.plant, commands)
 
     def _set_inertias(self, spec, now: "_Numbers") -> None:
         every = int(spec.compiler.inertiafromgeom) == 1  # They would win.
@@ -175,10 +183,12 @@ class MujocoTwin:
             if np.array_equal(size, _size(before)) and X.IsExactlyEqualTo(X_before):
                 continue
             geom = spec.geom(name)
-            if geom.meshname or np.isnan(size).any():
+            if geom.meshname:
                 raise ValueError(f"MuJoCo has no place for another {name}")
             k = m.geom(geom.id).id
-            own = RigidTransform(RotationMatrix(_matrix(m.geom_quat[k])), m.geom_pos[k])
+            own = RigidTransform(
+                RotationMatrix(rotation(m.geom_quat[k])), m.geom_pos[k]
+            )
             moved = X @ X_before.inverse() @ own
             geom.fromto, geom.alt.type = np.full(6, np.nan), 0
             geom.pos = moved.translation()
@@ -206,14 +216,12 @@ class MujocoTwin:
         law = drive_law(act) if act.joints else None
         takes = COMMANDS_OF[act.type]
         commands: dict[str, tuple[int, float]] = {}
-        late: dict[str, float] = {}
         numbers = dict[str, np.ndarray]()
         for model in dict.fromkeys(name.split(".")[0] for name in act.joints):
-            rows, delays = path_numbers(plant, model, effects)
+            rows, _ = path_numbers(plant, model, effects)
             for k, actuator in enumerate(actuators_of_model(plant, model)):
                 name = full_name(plant, actuator.joint())
                 numbers[name] = rows[:, k]
-                late[name] = delays[k]
                 if np.isfinite(actuator.effort_limit()):
                     numbers[name][LIMIT] = min(rows[LIMIT, k], actuator.effort_limit())
         for k, name in enumerate(act.joints):
@@ -237,7 +245,7 @@ class MujocoTwin:
             ):  # fmt: skip
                 if what in takes:
                     commands[f"{name}.{what}"] = (k, gain * factor)
-        return commands, {c: late[c.rpartition(".")[0]] for c in commands}
+        return commands
 
 
 class _Numbers:
@@ -267,7 +275,7 @@ class _Numbers:
 
 
 def _size(shape: Shape) -> np.ndarray:
-    """As MuJoCo has it; empty of one that has none, NaN of a mesh."""
+    """As MuJoCo has it; empty of one that has none, of a mesh its scale."""
     if isinstance(shape, Sphere):
         return np.array([shape.radius()])
     if isinstance(shape, Box):
@@ -276,15 +284,9 @@ def _size(shape: Shape) -> np.ndarray:
         return np.array([shape.radius(), 0.5 * shape.length()])
     if isinstance(shape, Ellipsoid):
         return np.array([shape.a(), shape.b(), shape.c()])
+    if isinstance(shape, (Convex, Mesh)):
+        return np.array(shape.scale3())
     return np.zeros(0)
-
-
-def _matrix(quat: np.ndarray) -> np.ndarray:
-    import mujoco
-
-    R = np.zeros(9)
-    mujoco.mju_quat2Mat(R, quat)
-    return R.reshape(3, 3)
 
 
 def _add_pair(spec, m, writer, one: int, other: int, friction: float) -> None:
@@ -309,7 +311,7 @@ def _add_pair(spec, m, writer, one: int, other: int, friction: float) -> None:
     )  # fmt: skip
 
 
-def _indexed(model, plant: MultibodyPlant, commands, delays) -> Twin:
+def _indexed(model, plant: MultibodyPlant, commands) -> Twin:
     q = np.full(plant.num_positions(), -1)
     v = np.full(plant.num_velocities(), -1)
     spins = []
@@ -330,4 +332,4 @@ def _indexed(model, plant: MultibodyPlant, commands, delays) -> Twin:
         spins.append((int(turn), int(first)))
     if (q < 0).any() or (v < 0).any():
         raise ValueError("MuJoCo's model has other joints than the scene")
-    return Twin(model, q, v, tuple(spins), commands, delays)
+    return Twin(model, q, v, tuple(spins), commands)

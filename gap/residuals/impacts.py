@@ -454,12 +454,6 @@ class ImpactProblem(ImpactWindows, WindowedProblem):
             return Nuisances.none(len(self.base()))
         return Nuisances(np.stack(columns, 1), np.array(prior), self._names, REACH)
 
-    def has_commands(self) -> bool:
-        return any(self._commanded(recording) for recording in self.recordings)
-
-    def row_sec(self) -> float:
-        return min(recording.period_sec() for recording in self.recordings)
-
     def of_late_commands(self) -> np.ndarray:
         """(m,) what each second by which commands act later adds to the residual."""
         now, base, step = self.commands_late, self.base(), LATE_SHARE * self.row_sec()

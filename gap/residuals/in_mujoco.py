@@ -68,12 +68,11 @@ class MujocoProblem(WindowModel, WindowedProblem):
         self.windows = list(self.windows)
         self._weighed_by: tuple = ()
         self._in_parts = False
+        if commands_late is not None:
+            self.set_commands_late(commands_late)
         self._weigh(())
         if commands_late is None:
             self._set_late(())
-        else:
-            self.set_commands_late(commands_late)
-            self._weigh(())
         self._share_out()
 
     def _best_start(self, time, states, row: int) -> int:
@@ -86,15 +85,12 @@ class MujocoProblem(WindowModel, WindowedProblem):
             pace += x[rows, 2] ** 2 / max(float(np.mean(x[:, 2] ** 2)), 1e-12)
         return int(rows[np.argmin(pace)]) if len(rows) else row
 
-    def _row_sec(self) -> float:
-        return min(recording.period_sec() for recording in self.recordings)
-
     def _set_late(self, effects: Sequence[Effect]) -> None:
         """A loop that writes its row after a step writes what acted since the step, and
         changes what acts between two rows."""
-        if not any(map(self._commanded, self.recordings)):
+        if not self.has_commands():
             return
-        row, now = self._row_sec(), self.commands_late
+        row, now = self.row_sec(), self.commands_late
         left = {}
         for share in LATE:
             self.set_commands_late(share * row)
@@ -108,8 +104,7 @@ class MujocoProblem(WindowModel, WindowedProblem):
     def _share_out(self) -> None:
         """Every third window is held out, of those that differ as much: most of a log
         may be rest. Where one window has it all, every third part of each is."""
-        square, number = self.base() ** 2, self.blocks()
-        off = np.bincount(number, square) / np.maximum(np.bincount(number), 1)
+        off = self._by_windows(self.base())
         train = np.ones(len(off), bool)
         train[np.argsort(off)[::-1][1::3]] = False
         self.windows = [
@@ -117,6 +112,11 @@ class MujocoProblem(WindowModel, WindowedProblem):
         ]
         held = off[~train].mean() if len(off) > 1 else 0.0
         self._in_parts = bool(held < UNEVEN * off[train].mean())
+
+    def _by_windows(self, left: np.ndarray) -> np.ndarray:
+        """Mean square of the rows (m,) of each window."""
+        number = self.blocks()
+        return np.bincount(number, left**2) / np.maximum(np.bincount(number), 1)
 
     def train(self) -> np.ndarray:
         """(m,) which rows are fitted."""
@@ -133,8 +133,7 @@ class MujocoProblem(WindowModel, WindowedProblem):
 
     def loudest(self, fitted: Fitted) -> tuple[str, float]:
         """The window of which most is left."""
-        square, number = fitted.left**2, self.blocks()
-        off = np.bincount(number, square) / np.maximum(np.bincount(number), 1)
+        off = self._by_windows(fitted.left)
         k = int(np.argmax(off))
         w = self.windows[k]
         name = self.recordings[w.recording].name

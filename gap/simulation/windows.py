@@ -255,6 +255,14 @@ class WindowModel(WindowedResidual):
         self.commands_late = seconds
         self._commands, self._base = {}, None
 
+    def has_commands(self) -> bool:
+        """Whether any recording has commands that the scene's drives take."""
+        return any(self._commanded(recording) for recording in self.recordings)
+
+    def row_sec(self) -> float:
+        """Period of the rows [s]: the shortest of the recordings'."""
+        return min(recording.period_sec() for recording in self.recordings)
+
     def of_unmeasured(self) -> "WindowModel | None":
         """The same windows, which simulate the coordinates that were not measured; None
         where all were."""
