@@ -43,7 +43,7 @@ def overlapping(
     root = diagram.CreateDefaultContext()
     context = plant.GetMyContextFromRoot(root)
     found: dict[tuple[str, str], None] = {}
-    root = _roots(plant)
+    carrier = _roots(plant)
     for log in positions:
         joints = [j for j in one_dof_joints(plant)
                   if j.num_positions() and full_name(plant, j) in log]  # fmt: skip
@@ -61,7 +61,7 @@ def overlapping(
                 if pair.depth > TOUCHES:
                     frames = (inspector.GetFrameId(g) for g in (pair.id_A, pair.id_B))
                     bodies = [plant.GetBodyFromFrameId(frame) for frame in frames]
-                    roots = {root[int(body.index())] for body in bodies}
+                    roots = {carrier[int(body.index())] for body in bodies}
                     if len(roots) > 1 and roots.isdisjoint(guessed):
                         continue  # What does not hang together may touch.
                     one, other = sorted(b.scoped_name().get_full() for b in bodies)

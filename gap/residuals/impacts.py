@@ -25,7 +25,7 @@ from makebreak.gap.residuals.contact_candidates import reader_of_trial
 from makebreak.gap.residuals.mechanism import link_changes
 from makebreak.gap.residuals.objects import WindowedProblem
 from makebreak.gap.simulation.contact_shapes import ContactShapes, poses_of
-from makebreak.gap.simulation.windows import Window, WindowModel, with_step
+from makebreak.gap.simulation.windows import Window, WindowModel, drawn, with_step
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.contact import CONTACT_LAW, DAMPER, DISSIPATION, STIFFNESS
@@ -388,16 +388,6 @@ class ImpactWindows(WindowModel):
             replace(w, std=np.sqrt(w.std**2 + v + (BLUR * np.ptp(y, axis=0)) ** 2))
             for w, v, y in zip(self.windows, wide, plain, strict=True)
         ]
-
-
-def drawn(w: Window, rng) -> Window:
-    """The window from another start that its measurements allow."""
-    state = {}
-    for name, x in w.state.items():
-        values, u = np.linalg.eigh(w.spread[name])
-        state[name] = np.array(x)
-        state[name][:2] += u @ (np.sqrt(np.maximum(values, 0.0)) * rng.normal(size=2))
-    return replace(w, state=state)
 
 
 class ImpactProblem(ImpactWindows, WindowedProblem):

@@ -28,7 +28,7 @@ from makebreak.gap.simulation.contact_shapes import (
 )
 from makebreak.gap.simulation.face_supports import LiesOn, add_supports
 from makebreak.gap.simulation.scene_simulation import SceneSimulation
-from makebreak.gap.simulation.windows import BESIDE, TURN, Window, WindowModel
+from makebreak.gap.simulation.windows import BESIDE, TURN, Window, WindowModel, drawn
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.contact import FRICTION
@@ -303,7 +303,7 @@ class PushWindows(WindowModel):
         kept = self.windows
         try:
             for _ in range(DRAWS):
-                self.windows = [_drawn(w, rng) for w in kept]
+                self.windows = [drawn(w, rng) for w in kept]
                 self._draw = rng
                 add(self.simulate(effects), 1.0 / DRAWS)
         finally:
@@ -409,14 +409,3 @@ def led_as_measured(
         kd=[float(2.0 * m * LED_RATE) for m in inertia], rate_hz=act.rate_hz,
     )  # fmt: skip
     return replace(scene, actuation=drive), known
-
-
-def _drawn(w: Window, rng) -> Window:
-    """The window from another start that its measurements allow."""
-    state = {}
-    for name, x in w.state.items():
-        P = w.spread[name]
-        values, u = np.linalg.eigh(P)
-        state[name] = np.array(x)
-        state[name][:2] += u @ (np.sqrt(np.maximum(values, 0.0)) * rng.normal(size=2))
-    return replace(w, state=state)

@@ -146,6 +146,16 @@ def _most_seen(seen: np.ndarray, every: int) -> int:
     return max(offsets, key=lambda at: float(np.mean(seen[at::every])))
 
 
+def drawn(w: Window, rng) -> Window:
+    """The window from another start that its measurements allow."""
+    state = {}
+    for name, x in w.state.items():
+        values, u = np.linalg.eigh(w.spread[name])
+        state[name] = np.array(x)
+        state[name][:2] += u @ (np.sqrt(np.maximum(values, 0.0)) * rng.normal(size=2))
+    return replace(w, state=state)
+
+
 def n_rows(window) -> int:
     rows = window.rows
     return len(range(rows.start, rows.stop, rows.step or 1))
