@@ -107,3 +107,15 @@ def test_which_problems_are_of_equations():
     equations = {ContactProblem, PressingProblem, MechanismProblem}
     assert not any(each.by_equations for each in windows | {TouchProblem})
     assert all(each.by_equations for each in equations)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "goes"),
+    [
+        (5.28, 1.03, "falls from 5.28 to 1.03 times"),
+        (1.03, 1.1, "goes from 1.03 to 1.1 times"),
+        (1.031, 1.029, "stays at 1.03 times"),
+    ],
+)
+def test_how_the_held_out_error_goes_is_said(before, after, goes):
+    assert goes in says("gap_named", [], measure(before, after))
