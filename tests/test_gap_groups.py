@@ -9,12 +9,18 @@ from test_gap_sticking import recorded
 
 from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.numerics.selection import Screen
-from makebreak.gap.problem import Candidate
+from makebreak.gap.problem import Candidate, Nuisances, SearchPlan
 from makebreak.gap.residuals.mechanism import MechanismProblem
 from makebreak.gap.result import Estimate, Evidence, NamedEffect
 from makebreak.gap.said import said_together
 from makebreak.gap.search.comparison import Comparison
-from makebreak.gap.search.groups import _needless_member, groups_of, of_more_kinds
+from makebreak.gap.search.groups import (
+    _needless_member,
+    groups_of,
+    of_more_kinds,
+    with_pruned_groups,
+)
+from makebreak.gap.search.screen import rank
 from makebreak.models.effects.kind import Effect
 
 
@@ -63,12 +69,14 @@ NAMES = ("coulomb", "damping", "inertia")
 def search_of(left, train, channel):
     problem = SimpleNamespace(
         is_within_tolerance=lambda effect: False, by_equations=True,
-        dynamics=SimpleNamespace(now=lambda kind, at: {"kp": 10.0}),
+        dynamics=SimpleNamespace(now=lambda kind, at: {"kp": 10.0}), correlation=1.0,
+        weighed_by=lambda effects: None,
     )  # fmt: skip
-    return SimpleNamespace(
-        train=train, channel=channel, problem=problem, error=lambda score: score,
-        plan=SimpleNamespace(least_gain=0.1),
-    )  # fmt: skip
+    search = object.__new__(Comparison)
+    search.train, search.channel, search.problem = train, channel, problem
+    search.plan, search.start = SearchPlan(), SimpleNamespace(score=0.0)
+    search.nuisances = Nuisances.none(len(left))
+    return search
 
 
 def test_what_joints_lack_of_several_kinds_is_found_at_once():
@@ -100,10 +108,11 @@ def test_what_joints_lack_of_several_kinds_is_found_at_once():
         left += 10.0 * (1.0 - 1.0 / gains[i]) * column
         read = (lambda c: {"kp": 10.0 / (1.0 - c[0] / 10.0)},)
         found.append(Candidate("servo_gain", (joint,), 1, (column[:, None],), read))
+    left = left / 0.01  # In units of noise.
+    found = [replace(c, columns=(c.columns[0] / 0.01,)) for c in found]
     search = search_of(left, train, channel)
     screen = Screen(left, np.zeros((2 * n, 0)), np.zeros(0), train)
-    (group,) = (g for g in groups_of(found) if g.kind == KINDS[0])
-    wider = of_more_kinds(search, screen, found, group)
+    wider = of_more_kinds(search, screen, found, KINDS[0])
     truth = {(kind, f"r.j{i + 1}"): x for kind, x in hidden.items() for i in range(2)}
     truth[("servo_gain", "r.j1")] = 10.0 * gains[0]
     truth[("payload", "r.hand")] = 1.3
@@ -111,6 +120,36 @@ def test_what_joints_lack_of_several_kinds_is_found_at_once():
     assert ours.keys() == truth.keys()
     for key, value in truth.items():
         assert ours[key] == pytest.approx(value, rel=0.02), key
+
+
+@pytest.mark.parametrize(
+    "sizes, places", [((0.7, 0.7), 1), ((0.7, 0.4), 2), ((0.7, 0.0), 0)]
+)
+def test_what_like_joints_have_alike_is_one_number(sizes, places):
+    """Of three joints the third hardly tells its friction: 0.5 +- 1. One value for all
+    is no less likely there; where the two others differ, it is none of the group."""
+    rng = np.random.default_rng(3)
+    n = 900
+    channel, train = np.repeat([0, 1, 2], n), np.arange(3 * n) // 30 % 3 != 1
+    left, found = rng.normal(size=3 * n), []
+    for k, (size, shows) in enumerate(
+        zip((*sizes, 0.5), (3.0, 3.0, 0.04), strict=True)
+    ):
+        column = np.where(channel == k, shows * rng.normal(size=3 * n), 0.0)
+        left += size * column
+        read = (lambda c: {"coulomb": float(c[0])},)
+        found.append(Candidate(KINDS[0], (f"r.j{k}",), 1, (column[:, None],), read))
+    screen = Screen(left, np.zeros((3 * n, 0)), np.zeros(0), train)
+    pruned = with_pruned_groups(
+        search_of(left, train, channel), screen, rank(screen, groups_of(found))
+    )
+    effects = [e for each in pruned for e in each.effects]
+    assert len(effects) == places
+    if places == 1:
+        assert effects[0].at == ["r.j0", "r.j1", "r.j2"]
+        assert effects[0].parameters["coulomb"] == pytest.approx(0.7, rel=0.03)
+    for e, size in zip(effects[:2] if places == 2 else (), sizes, strict=False):
+        assert e.parameters["coulomb"] == pytest.approx(size, rel=0.05)
 
 
 def effect_at(joint, value, ties=()):

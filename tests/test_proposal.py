@@ -531,10 +531,18 @@ SERVO_SLIDE = """<robot name="s"><link name="base"/><link name="cart"><inertial>
 </robot>"""
 
 
-def test_a_servo_is_proposed_with_the_gains_that_its_motion_tells(tmp_path):
+@pytest.mark.parametrize("limit, taken", [("300", 300.0), ("20", 1e9)])
+def test_a_servo_is_proposed_with_the_gains_that_its_motion_tells(
+    tmp_path, limit, taken
+):
     """A slide on level ground sags nowhere; its dry friction is not taken for a gain,
-    nor that its command holds until the next one for damping."""
-    (tmp_path / "s.urdf").write_text(SERVO_SLIDE)
+    nor that its command holds until the next one for damping. The motion needs 34 N, so
+    that a file's limit of 20 N is none."""
+    motor = '<transmission><type>transmission_interface/SimpleTransmission</type>'
+    motor += '<joint name="x"/><actuator name="m"/></transmission></robot>'
+    text = SERVO_SLIDE.replace('effort="300"', f'effort="{limit}"')
+    text = text.replace("</robot>", motor)
+    (tmp_path / "s.urdf").write_text(text)
     kp, kd, coulomb, step = 4000.0, 300.0, 15.0, 5e-4
     x, v, u, rows, told = 0.0, 0.0, 0.0, [], 0.0
     for k in range(int(20.0 / step)):
@@ -556,6 +564,7 @@ def test_a_servo_is_proposed_with_the_gains_that_its_motion_tells(tmp_path):
     np.testing.assert_allclose(scene.actuation.kd, kd, rtol=0.02)
     assert not scene.effects  # No rotor that is not there.
     assert scene.tolerance == {"drive_gains": 0.05} and not proposal.findings()
+    assert scene.actuation.limit == [taken]
 
 
 def test_of_a_servo_that_needs_no_effort_the_rest_goes_with_its_stiffness():
@@ -567,7 +576,8 @@ def test_of_a_servo_that_needs_no_effort_the_rest_goes_with_its_stiffness():
     equations = np.stack([error, -v, -np.sign(v), -vd], axis=1), np.zeros(400)
     assert _fitted([equations]) is None
     found = _fitted_at(kp, [equations])
-    expected = ServoGains(kp, kd, rotor, coulomb)
+    most = np.abs(coulomb * np.sign(v) + rotor * vd).max()
+    expected = ServoGains(kp, kd, rotor, coulomb, most)
     np.testing.assert_allclose(astuple(found), astuple(expected), rtol=1e-6)
 
 
@@ -745,6 +755,25 @@ def test_gains_of_the_file_are_taken_where_parts_of_a_law_nearly_cancel(kp, told
     (found,) = gains_of_efforts([log], [(80.0, 3.0)])
     # Rates averaged over 0.2 s: half a per cent.
     assert found.kp == pytest.approx(told, rel=5e-3)
+
+
+@pytest.mark.parametrize("known", [None, (40.0, 2.0)])
+@pytest.mark.parametrize("late", [0.0, 0.0126])
+def test_efforts_tell_gains_beside_late_commands_and_another_zero(known, late):
+    """Of two joints one has its zero 0.04 rad off; commands come 6.3 rows late."""
+    t = 0.002 * np.arange(8000)
+    q = np.stack([np.sin(2.0 * t), 0.5 * np.cos(3.1 * t)], axis=1)
+    v = np.stack([2.0 * np.cos(2.0 * t), -1.55 * np.sin(3.1 * t)], axis=1)
+
+    def told(t):
+        own = (np.sin(2.0 * t + 0.2), np.sin(7.0 * t), np.cos(3.1 * t), np.sin(9.0 * t))
+        return np.stack([own[0] + 0.2 * own[1], 0.4 * own[2] + 0.1 * own[3]], axis=1)
+
+    effort = 40.0 * (told(t - late) - q + [0.0, 0.04]) - 2.0 * v
+    found = gains_of_efforts([ServoLog(t, q, told(t), effort)], [known] * 2)
+    # Rates averaged over 0.2 s: half a per cent.
+    np.testing.assert_allclose([g.kp for g in found], 40.0, rtol=5e-3)
+    np.testing.assert_allclose([g.kd for g in found], 2.0, rtol=1e-2)
 
 
 def test_efforts_that_a_servo_does_not_give_drive_the_joints(tmp_path):

@@ -986,7 +986,9 @@ def _actuation(judged: Judged, kinds, logs, notes: list[str]) -> tuple[list[str]
             f"  kd: {kd}  # [N m s/rad], {by_motion if every_one else 'a guess'}.",
         ]
         limits = {j: robot.effort_limits.get(j, np.inf) for j in joints}
-        lines += _limits(limits, judged.most, notes)
+        most = {j: max(gains[j].most if j in gains else 0.0, judged.most.get(j, 0.0))
+                for j in joints}  # fmt: skip
+        lines += _limits(limits, most, notes)
         if every_one and not servos:
             lines.append(f"tolerance: {{drive_gains: {GAINS_KNOWN_TO}}}")
         # A geared motor's own inertia is what its back-EMF and its spring work on.

@@ -13,7 +13,7 @@ import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import MultibodyForces
 from scipy.ndimage import minimum_filter1d
-from scipy.optimize import nnls
+from scipy.optimize import minimize_scalar, nnls
 
 from makebreak.models.effects.kind import one_dof_joints
 
@@ -25,18 +25,25 @@ PARTS = 5  # Of the data: each is predicted from the others,
 LARGEST_SPREAD = 0.15  # whose stiffnesses differ by less than this share (1 sigma),
 LEAST_EXPLAINED = 0.8  # and of what the rest leaves the stiffness explains this.
 LAW_LEAVES = 0.01  # Of the variance of an effort that is what its servo gives.
+# Commands are late where each joint's law leaves so many times less for it (by the
+# geometric mean); at most so late [s].
+LATE_LEAVES, MOST_LATE = 4.0, 0.1
+# Of a variance, that means over 0.2 s may leave, and that rounding does.
+BENT, NOTHING = 1e-4, 1e-12
 LAW_OFF = 0.03  # Of the gains of a file, which are rather taken than those of a fit.
 
 
 @dataclass(frozen=True)
 class ServoGains:
     """kp [N m/rad], kd [N m s/rad] with a joint's damping in it, rotor [kg m2], Coulomb
-    friction [N m]; of a joint that slides [N/m], [N s/m], [kg], [N]."""
+    friction [N m]; of a joint that slides [N/m], [N s/m], [kg], [N]. most: effort that
+    the motion needed, with these."""
 
     kp: float
     kd: float
     rotor: float
     friction: float
+    most: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,50 +90,86 @@ def gains_of_efforts(
 ) -> list[ServoGains | None]:
     """Of each joint, where its measured effort is kp (command - position) - kd velocity
     and nothing else, as of simulated servos and of motors that report what they were
-    told to give. None of the others.
+    told to give, from where they take their zero and however late commands reach all of
+    them. None of the others.
 
     Args: known: kp and kd of the robot's file: they are taken where they fit as well.
     """
-    parts: list[list] = [[] for _ in known]
-    for motion in motions:
-        averaged = averaged_motion(motion)
-        if averaged is None or motion.effort is None:
-            return [None] * len(parts)
-        even, step, _, (kernel, *_), (mean, rate, rate2) = averaged
-        for i, own in enumerate(parts):
-            # Both as they are in their rows: between these a step of the command
-            # changes them alike. A row's rate may be that of a row before or after.
-            told, effort = (
-                np.convolve(np.interp(even, motion.time, y[:, i]), kernel, "valid")
-                for y in (motion.command, motion.effort)
-            )
-            rates = rate[:, i, None] + [-step, step] * rate2[:, i, None]
-            own.append((np.column_stack([told - mean[:, i], -rates]), effort))
-    return [_law(*each) for each in zip(parts, known, strict=True)]
+    averaged = [averaged_motion(motion) for motion in motions]
+    if any(
+        each is None or motion.effort is None
+        for each, motion in zip(averaged, motions, strict=True)
+    ):
+        return [None] * len(known)
+
+    def laws(late: float) -> list[tuple[float, ServoGains | None]]:
+        parts: list[list] = [[] for _ in known]
+        for motion, each in zip(motions, averaged, strict=True):
+            for own, rows in zip(parts, _law_rows(motion, each, late), strict=True):
+                own.append(rows)
+        return [_law(*each) for each in zip(parts, known, strict=True)]
+
+    def cost(late: float) -> float:
+        return sum(float(np.log(left)) for left, _ in laws(late))
+
+    if not motions or not known:
+        return [None] * len(known)
+    now = [gains for _, gains in laws(0.0)]
+    if all(g and k and g.kp == k[0] for g, k in zip(now, known, strict=True)):
+        return now  # As the file has them.
+    step = min(each[1] for each in averaged)
+    some = np.arange(0.0, MOST_LATE, step)
+    costs = [cost(late) for late in some]
+    k = int(np.argmin(costs))
+    most = len(known) * np.log(LATE_LEAVES)
+    if not costs[0] - max(costs[k], len(known) * np.log(BENT)) > most:
+        return now
+    around = (some[k] - step, some[k] + step)
+    late = float(minimize_scalar(cost, bounds=around, method="bounded").x)
+    return [gains for _, gains in laws(late)]
 
 
-def _law(parts: Sequence[tuple[np.ndarray, np.ndarray]], known) -> ServoGains | None:
-    """From error and rates (m, 3), and effort (m,), of each log."""
-    if not parts:
-        return None
+def _law_rows(motion: ServoLog, averaged, late: float):
+    """Of each joint error and rates (m, 3), and effort (m,), of commands that act so
+    late [s]."""
+    even, step, _, (kernel, *_), (mean, rate, rate2) = averaged
+    for i in range(mean.shape[1]):
+        # Both as they are in their rows: between these a step of the command changes
+        # them alike. A row's rate may be that of a row before or after.
+        told, effort = (
+            np.convolve(np.interp(even - by, motion.time, y[:, i]), kernel, "valid")
+            for y, by in ((motion.command, late), (motion.effort, 0.0))
+        )
+        rates = rate[:, i, None] + [-step, step] * rate2[:, i, None]
+        yield np.column_stack([told - mean[:, i], -rates]), effort
+
+
+def _law(
+    parts: Sequence[tuple[np.ndarray, np.ndarray]], known
+) -> tuple[float, ServoGains | None]:
+    """The share of its effort's variance that a law leaves, and the law. From error and
+    rates (m, 3), and effort (m,), of each log."""
     X, y = (np.concatenate(each) for each in zip(*parts, strict=True))
     if not (np.isfinite(X).all() and np.isfinite(y).all() and np.ptp(y) > 0.0):
-        return None
-    most = LAW_LEAVES * np.var(y) * len(y)
+        return 1.0, None
+    X, y = X - X.mean(axis=0), y - y.mean()  # A zero that is another is no other law.
+    whole = float(y @ y)
     if known is not None:
         kp, kd = known
         other = kd * (X[:, 2] - X[:, 1])  # Of so much of its rate the row after.
         rest = y - kp * X[:, 0] - kd * X[:, 1]
         share = np.clip(rest @ other / max(other @ other, 1e-300), 0.0, 1.0)
+        left = float(np.sum((rest - share * other) ** 2))
         # Where its parts nearly cancel, as at a light joint, efforts tell no size.
-        parted = LAW_OFF**2 * kp**2 * np.sum((X[:, 0] - X[:, 0].mean()) ** 2)
-        if np.sum((rest - share * other) ** 2) < max(most, parted):
-            return ServoGains(kp, kd, 0.0, 0.0)
+        parted = LAW_OFF**2 * kp**2 * np.sum(X[:, 0] ** 2)
+        if left < max(LAW_LEAVES * whole, parted):
+            return max(left / whole, NOTHING), ServoGains(kp, kd, 0.0, 0.0)
     size = np.maximum(np.sqrt(np.mean(X**2, axis=0)), 1e-12)
-    c, left = nnls(X / size, y)
+    c, root = nnls(X / size, y)
     kp, *rates = c / size
-    good = kp > 0.0 and left**2 < most
-    return ServoGains(float(kp), float(sum(rates)), 0.0, 0.0) if good else None
+    left = max(float(root**2) / whole, NOTHING)
+    good = kp > 0.0 and left < LAW_LEAVES
+    return left, ServoGains(float(kp), float(sum(rates)), 0.0, 0.0) if good else None
 
 
 def _joints(plant: MultibodyPlant) -> list:
@@ -263,7 +306,8 @@ def _fitted(parts: Sequence[tuple[np.ndarray, np.ndarray]]) -> ServoGains | None
     agree = float(np.std(stiff)) <= LARGEST_SPREAD * kp
     if not kp > 0.0 or not agree or left > (1.0 - LEAST_EXPLAINED) * without:
         return None
-    return ServoGains(float(kp), float(kd), float(rotor), float(friction))
+    most = np.abs(y - X[:, 2:] @ (friction, rotor)).max()
+    return ServoGains(float(kp), float(kd), float(rotor), float(friction), float(most))
 
 
 def _fitted_at(kp: float, parts: Sequence[tuple[np.ndarray, np.ndarray]]):
@@ -277,4 +321,5 @@ def _fitted_at(kp: float, parts: Sequence[tuple[np.ndarray, np.ndarray]]):
     if left**2 > (1.0 - LEAST_EXPLAINED) * float(given @ given):
         return None
     kd, friction, rotor = c / size
-    return ServoGains(kp, float(kd), float(rotor), float(friction))
+    most = np.abs(y - X[:, 2:] @ (friction, rotor)).max()
+    return ServoGains(kp, float(kd), float(rotor), float(friction), float(most))

@@ -16,6 +16,7 @@ from makebreak.gap.search.choice import (
 )
 from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.search.groups import (
+    PLACES,
     groups_of,
     of_more_kinds,
     with_pruned_groups,
@@ -194,12 +195,12 @@ def _wider(
     """What many joints have, with all else that joints may have, where that leaves
     clearly less."""
     wide, screen = screens
-    group = pick.ranked.candidate
-    if group.kind not in KINDS or not group.members:
+    of = pick.ranked.candidate
+    if of.kind not in KINDS or not (of.members or len(of.at) > 1):
         return None
     if not search.needs_more(pick.fit):
         return None
-    found = of_more_kinds(search, wide, free, group)
+    found = of_more_kinds(search, wide, free, of.kind)
     for trial in fit_each(search, screen, chosen, [found] if found else []):
         if search.error(trial.fit.score) < search.enough(pick.fit.score):
             return trial
@@ -233,7 +234,8 @@ def _choices(
             runner.ranked.candidate.name if runner else "",
             runner.fit.score / fit.score - 1.0 if runner else np.inf,
             ties, fixed[k], sizes[k], is_group, both_needed,
-            len(new) > 1 and not is_group, needed_beside=tuple(
+            len(new) > 1 and not (is_group and KINDS[effect.kind].at in PLACES),
+            needed_beside=tuple(
                 (e.kind, tuple(e.at)) for e in new if both_needed and e is not effect
             ),
             why=why_not(runner.ranked.candidate, best.candidate) if runner else "",

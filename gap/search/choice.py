@@ -148,9 +148,11 @@ def pair_of(a: Ranked, b: Ranked, effects: Sequence[Effect]) -> Ranked:
 
 def complexity(candidate: Candidate) -> int:
     """Twice the number of parameters, by which the simplest is taken. A kind some of
-    whose parameters are left at neutral counts little less than all of it."""
+    whose parameters are left at neutral counts little less than all of it, and one that
+    many joints have with one value little more than at one of them."""
     all_of_them = candidate.size + len(candidate.fixed)
-    return 2 * all_of_them - bool(candidate.fixed)
+    is_shared = len(candidate.at) > 1 and not candidate.members
+    return 2 * all_of_them - bool(candidate.fixed) + is_shared
 
 
 def why_not(other: Candidate, chosen: Candidate) -> str:

@@ -243,15 +243,35 @@ class Comparison:
         Source: Schwarz, Ann. Stat. 6(2), 1978 (BIC), as -2 times the logarithm of the
         ratio of likelihoods, with the nuisances' prior.
         """
-        least = max(min(one.fit.held_out, other.fit.held_out), 1.0)
+        least = min(one.fit.held_out, other.fit.held_out)
+        n = self.nuisances.prior
+        cost = [float(np.sum((f.b / n) ** 2)) for f in (one, other)]
+        return self._evidence(one.left, other.left, least, more) + cost[1] - cost[0]
+
+    def evidence_by_columns(self, screen: Screen, one, other) -> float:
+        """The same of columns (m, k), beside others that a screen may have as further
+        nuisances, which cost next to nothing."""
+        fits = [screen.fit(X) for X in (one, other)]
+        b, left = zip(
+            *(screen.fit_nuisances(screen.r - X @ fit.c)
+              for X, fit in zip((one, other), fits, strict=True)),
+            strict=True,
+        )  # fmt: skip
+        prior, more = self.nuisances.prior, one.shape[1] - other.shape[1]
+        cost = [float(np.sum((x[: len(prior)] / prior) ** 2)) for x in b]
+        least = min(fit.held_out for fit in fits)
+        return self._evidence(*left, least, more) + cost[1] - cost[0]
+
+    def _evidence(self, one, other, least: float, more: int) -> float:
+        """Of what two models leave of rows (m,), the better of them `least` of those
+        held out, and of `more` parameters."""
         off = MODEL_ERROR_SHARE * self.start.score
         together = self.problem.correlation**2  # Neighbouring rows that say the same.
-        squares = (other.left**2 - one.left**2) / (together * (least**2 + off**2))
+        squares = (other**2 - one**2) / (together * (max(least, 1.0) ** 2 + off**2))
         blocks = by_block(squares, self.train)
-        cost = [float(np.sum((f.b / self.nuisances.prior) ** 2)) for f in (one, other)]
         rows = max(len(squares) / together, 1.0)
         data = float(blocks.sum() - blocks.max(initial=0.0))
-        return data + cost[1] - cost[0] - more * float(np.log(rows))
+        return data - more * float(np.log(rows))
 
     # ----- Fits
 

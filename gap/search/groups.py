@@ -25,7 +25,7 @@ from makebreak.gap.thresholds import (
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 
-_PLACES = ("joint", "actuator", "channel", "drive")
+PLACES = ("joint", "actuator", "channel", "drive")
 # Units of what a joint may have beside what all joints have.
 _FORCES = ("N m", "N m s/rad", "N m/rad", "kg m2")
 
@@ -36,7 +36,7 @@ def groups_of(found: Sequence[Candidate]) -> list[Candidate]:
     for c in found:
         single = len(c.columns) == 1 and c.columns[0].shape[1] == 1 and len(c.at) == 1
         single = single and "." in c.at[0]  # Not all joints of a model, with one value.
-        if KINDS[c.kind].at in _PLACES and single and not c.fixed:
+        if KINDS[c.kind].at in PLACES and single and not c.fixed:
             by_kind.setdefault(c.kind, []).append(c)
     return [
         Candidate(
@@ -49,14 +49,19 @@ def groups_of(found: Sequence[Candidate]) -> list[Candidate]:
 
 
 def of_more_kinds(
-    search: Comparison, screen: Screen, free: Sequence[Candidate], group: Candidate
+    search: Comparison, screen: Screen, free: Sequence[Candidate], kind: str
 ) -> Ranked | None:
-    """A group with all other groups of forces at joints, and what else earns its place
-    beside these, less the members that do not; None where that is the same group."""
+    """A kind at many joints with all other groups of forces at joints, and what else
+    earns its place beside these, less the members that do not; None where that is the
+    kind alone."""
+    groups = {g.kind: g for g in groups_of(free)}
+    if kind not in groups:
+        return None
+    own = groups.pop(kind)
     members = [
-        *group.members,
-        *(m for other in groups_of(free) if other.kind != group.kind
-          and KINDS[other.kind].parameters[0].unit in _FORCES for m in other.members),
+        *own.members,
+        *(m for g in groups.values()
+          if KINDS[g.kind].parameters[0].unit in _FORCES for m in g.members),
     ]  # fmt: skip
     there = {id(m) for m in members}
     others = [c for c in free if not c.members and id(c) not in there]
@@ -75,9 +80,8 @@ def of_more_kinds(
         )
         others = [c for c in others if c is not of]
         wide, score = wide.beside(best.columns, FREE_TOLERANCE), less
-    whole = replace(group, members=tuple(members))
-    wider = _pruned(search, screen, Ranked(whole, screen.fit(), (), True, 0))
-    if wider is None or {m.kind for m in wider.candidate.members} == {group.kind}:
+    wider = _pruned(search, screen, own, members)
+    if wider is None or {m.kind for m in _parts(wider.candidate)} == {kind}:
         return None
     return wider
 
@@ -86,36 +90,72 @@ def with_pruned_groups(
     search: Comparison, screen: Screen, ranked: Sequence[Ranked]
 ) -> list[Ranked]:
     """Candidates, the best first, with groups reduced to the members that earn their
-    place; a group that is left with fewer than two members is dropped."""
+    place, or to one value for all of them; a group that is left at fewer than two
+    places is dropped."""
     out = []
     for each in ranked:
-        if not each.candidate.members:
+        of = each.candidate
+        if not of.members:
             out.append(each)
-        elif (smaller := _pruned(search, screen, each)) is not None:
+        elif (smaller := _pruned(search, screen, of, of.members)) is not None:
             out.append(smaller)
     return sorted(out, key=lambda r: r.fit.score)
 
 
-def _pruned(search: Comparison, screen: Screen, group: Ranked) -> Ranked | None:
-    members = list(group.candidate.members)
-    while len(members) >= MEMBERS_MIN:
+def _pruned(
+    search: Comparison, screen: Screen, group: Candidate, members: Sequence[Candidate]
+) -> Ranked | None:
+    """A group with those of these members that earn their place."""
+    members = _with_one_value(search, screen, members)
+    while sum(len(m.at) for m in members) >= MEMBERS_MIN:
         k = _needless_member(search, screen, members)
         if k is None:
             break
         members = members[:k] + members[k + 1 :]
-    if len(members) < MEMBERS_MIN:
+    if sum(len(m.at) for m in members) < MEMBERS_MIN:
         return None
-    X, of = _columns_of(members)
+    members = _with_one_value(search, screen, members)
+    X, _ = _columns_of(members)
     fit = screen.fit(X)
-    candidate = replace(
-        group.candidate,
+    candidate = members[0] if len(members) == 1 else replace(
+        group,
         at=tuple(at for m in members for at in m.at),
         size=sum(m.size for m in members),
         columns=(X,),
         members=tuple(members),
-    )
+    )  # fmt: skip
     found = _beside_gains(search, candidate.effects(0, fit.c))
     return Ranked(candidate, fit, found, True, 0) if candidate.is_sane(found) else None
+
+
+def _with_one_value(
+    search: Comparison, screen: Screen, members: Sequence[Candidate]
+) -> list[Candidate]:
+    """The members, those of a kind that joints may have alike as one with one value,
+    unless there is evidence for a value for each."""
+    members = list(members)
+    if not search.tells_by_evidence:
+        return members
+    for kind in dict.fromkeys(m.kind for m in members if KINDS[m.kind].at == "joint"):
+        some = [m for m in members if m.kind == kind]
+        if len(some) < MEMBERS_MIN:
+            continue
+        one = replace(
+            some[0], at=tuple(at for m in some for at in m.at),
+            columns=(np.sum([m.columns[0] for m in some], axis=0),),
+            least={name: max(m.least.get(name, -np.inf) for m in some)
+                   for name in some[0].least},
+        )  # fmt: skip
+        alike = [one if m is some[0] else m for m in members
+                 if m is some[0] or m.kind != kind]  # fmt: skip
+        each, whole = (_columns_of(of)[0] for of in (members, alike))
+        if not search.evidence_by_columns(screen, each, whole) > 0.0:
+            members = alike
+    return members
+
+
+def _parts(candidate: Candidate) -> tuple[Candidate, ...]:
+    return candidate.members or (candidate,)
 
 
 def _beside_gains(search: Comparison, effects: Sequence[Effect]) -> tuple[Effect, ...]:
