@@ -190,7 +190,12 @@ def _effects(
         for effect in result.effects:
             model = effect.at[0]
             if len(effect.at) > 1 or "." in model or model == "world":
-                if not any(_is_same(effect, other) for other in found):
+                alike = [o for o in found if _is_alike(effect, o)]
+                if alike:
+                    at = (*alike[0].at, *effect.at)
+                    one = replace(_mean([alike[0], effect]), at=at)
+                    found[found.index(alike[0])] = _said(one)
+                elif not any(_is_same(effect, other) for other in found):
                     found.append(effect)
                 continue
             like = [
@@ -209,6 +214,13 @@ def _effects(
 def _is_same(one: NamedEffect, other: NamedEffect) -> bool:
     """Whether both are one thing that two limbs show (how gravity points)."""
     return (one.kind, one.at) == (other.kind, other.at)
+
+
+def _is_alike(one: NamedEffect, other: NamedEffect) -> bool:
+    """Whether joints of two limbs have, to within deviations, one value of a kind that
+    the joints of each have alike."""
+    many = min(len(one.at), len(other.at)) > 1 and one.kind == other.kind
+    return many and KINDS[one.kind].at == "joint" and _agrees(one, other)
 
 
 def _agrees(one: NamedEffect, other: NamedEffect) -> bool:

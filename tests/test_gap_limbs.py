@@ -217,6 +217,23 @@ def test_what_limbs_have_otherwise_stays_at_their_joints():
     assert "r.a0" in effects[0].says
 
 
+@pytest.mark.parametrize("other, n", [(3.1, 1), (4.0, 2)])
+def test_what_joints_of_limbs_have_alike_is_one_effect_of_all(other, n):
+    each = [
+        result_of("gap_named", [replace(
+            delay(tuple(limb), 0.0), kind="joint_viscous_damping",
+            parameters={"damping": Estimate(x, 0.1, "N m s/rad")},
+        )])
+        for limb, x in zip(LIMBS, (3.0, other), strict=True)
+    ]  # fmt: skip
+    effects = joined(LIMBS, each).effects
+    assert len(effects) == n
+    if n == 1:
+        assert effects[0].at == ("r.a0", "r.a1", "r.b0", "r.b1")
+        assert effects[0].parameters["damping"].value == pytest.approx(3.05)
+        assert "3.05" in effects[0].says and "r.b1" in effects[0].says
+
+
 def test_errors_are_pooled_by_windows_and_a_channel_counts_where_it_is():
     one = result_of("gap_named", before=3.0, n=1).gap
     two = result_of("gap_named", before=5.0, n=3, channel="r.b0.position").gap

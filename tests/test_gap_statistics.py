@@ -952,6 +952,7 @@ def _picked(trials, correlation=1.0, cost=None):
         nuisances=SimpleNamespace(prior=np.array([0.1])),
     )  # fmt: skip
     search.evidence = partial(Comparison.evidence, search)
+    search._evidence = partial(Comparison._evidence, search)
     each = []
     for kind, (size, left) in trials.items():
         score = float(np.sqrt(np.mean(left[~train] ** 2)))

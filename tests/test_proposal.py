@@ -538,7 +538,7 @@ def test_a_servo_is_proposed_with_the_gains_that_its_motion_tells(
     """A slide on level ground sags nowhere; its dry friction is not taken for a gain,
     nor that its command holds until the next one for damping. The motion needs 34 N, so
     that a file's limit of 20 N is none."""
-    motor = '<transmission><type>transmission_interface/SimpleTransmission</type>'
+    motor = "<transmission><type>transmission_interface/SimpleTransmission</type>"
     motor += '<joint name="x"/><actuator name="m"/></transmission></robot>'
     text = SERVO_SLIDE.replace('effort="300"', f'effort="{limit}"')
     text = text.replace("</robot>", motor)
