@@ -16,7 +16,6 @@ from makebreak.gap.search.choice import (
 )
 from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.search.groups import (
-    PLACES,
     groups_of,
     of_more_kinds,
     with_pruned_groups,
@@ -234,8 +233,7 @@ def _choices(
             runner.ranked.candidate.name if runner else "",
             runner.fit.score / fit.score - 1.0 if runner else np.inf,
             ties, fixed[k], sizes[k], is_group, both_needed,
-            len(new) > 1 and not (is_group and KINDS[effect.kind].at in PLACES),
-            needed_beside=tuple(
+            len(new) > 1 and not is_group, needed_beside=tuple(
                 (e.kind, tuple(e.at)) for e in new if both_needed and e is not effect
             ),
             why=why_not(runner.ranked.candidate, best.candidate) if runner else "",

@@ -21,11 +21,12 @@ from makebreak.gap.thresholds import (
     MEMBER_GAIN,
     MEMBER_Z,
     MEMBERS_MIN,
+    UNEXPLAINED_RMS,
 )
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 
-PLACES = ("joint", "actuator", "channel", "drive")
+_PLACES = ("joint", "actuator", "channel", "drive")
 # Units of what a joint may have beside what all joints have.
 _FORCES = ("N m", "N m s/rad", "N m/rad", "kg m2")
 
@@ -36,7 +37,7 @@ def groups_of(found: Sequence[Candidate]) -> list[Candidate]:
     for c in found:
         single = len(c.columns) == 1 and c.columns[0].shape[1] == 1 and len(c.at) == 1
         single = single and "." in c.at[0]  # Not all joints of a model, with one value.
-        if KINDS[c.kind].at in PLACES and single and not c.fixed:
+        if KINDS[c.kind].at in _PLACES and single and not c.fixed:
             by_kind.setdefault(c.kind, []).append(c)
     return [
         Candidate(
@@ -132,9 +133,11 @@ def _with_one_value(
     search: Comparison, screen: Screen, members: Sequence[Candidate]
 ) -> list[Candidate]:
     """The members, those of a kind that joints may have alike as one with one value,
-    unless there is evidence for a value for each."""
+    unless there is evidence for a value for each. Where much is left with all of them,
+    nothing says that they are alike."""
     members = list(members)
-    if not search.tells_by_evidence:
+    left = screen.fit(_columns_of(members)[0]).held_out
+    if not search.tells_by_evidence or left > UNEXPLAINED_RMS:
         return members
     for kind in dict.fromkeys(m.kind for m in members if KINDS[m.kind].at == "joint"):
         some = [m for m in members if m.kind == kind]
