@@ -95,29 +95,28 @@ def gains_of_efforts(
 
     Args: known: kp and kd of the robot's file: they are taken where they fit as well.
     """
-    averaged = [averaged_motion(motion) for motion in motions]
-    if any(
-        each is None or motion.effort is None
-        for each, motion in zip(averaged, motions, strict=True)
-    ):
+    logs = [
+        (motion, averaged) for motion in motions
+        if motion.effort is not None and (averaged := averaged_motion(motion))
+    ]  # fmt: skip
+    if not logs or len(logs) < len(motions) or not known:
         return [None] * len(known)
 
     def laws(late: float) -> list[tuple[float, ServoGains | None]]:
         parts: list[list] = [[] for _ in known]
-        for motion, each in zip(motions, averaged, strict=True):
-            for own, rows in zip(parts, _law_rows(motion, each, late), strict=True):
-                own.append(rows)
+        for motion, averaged in logs:
+            rows = _law_rows(motion, averaged, late)
+            for own, some in zip(parts, rows, strict=True):
+                own.append(some)
         return [_law(*each) for each in zip(parts, known, strict=True)]
 
     def cost(late: float) -> float:
         return sum(float(np.log(left)) for left, _ in laws(late))
 
-    if not motions or not known:
-        return [None] * len(known)
     now = [gains for _, gains in laws(0.0)]
     if all(g and k and g.kp == k[0] for g, k in zip(now, known, strict=True)):
         return now  # As the file has them.
-    step = min(each[1] for each in averaged)
+    step = min(averaged[1] for _, averaged in logs)
     some = np.arange(0.0, MOST_LATE, step)
     costs = [cost(late) for late in some]
     k = int(np.argmin(costs))
@@ -133,6 +132,7 @@ def _law_rows(motion: ServoLog, averaged, late: float):
     """Of each joint error and rates (m, 3), and effort (m,), of commands that act so
     late [s]."""
     even, step, _, (kernel, *_), (mean, rate, rate2) = averaged
+    assert motion.effort is not None
     for i in range(mean.shape[1]):
         # Both as they are in their rows: between these a step of the command changes
         # them alike. A row's rate may be that of a row before or after.

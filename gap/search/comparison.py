@@ -260,7 +260,7 @@ class Comparison:
         prior, more = self.nuisances.prior, one.shape[1] - other.shape[1]
         cost = [float(np.sum((x[: len(prior)] / prior) ** 2)) for x in b]
         least = min(fit.held_out for fit in fits)
-        return self._evidence(*left, least, more) + cost[1] - cost[0]
+        return self._evidence(left[0], left[1], least, more) + cost[1] - cost[0]
 
     def _evidence(self, one, other, least: float, more: int) -> float:
         """Of what two models leave of rows (m,), the better of them `least` of those
