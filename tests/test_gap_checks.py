@@ -332,6 +332,18 @@ def test_excitation_tells_a_joint_that_never_turns_back(tmp_path):
     assert e.range == pytest.approx(2.0, rel=0.01)
 
 
+@pytest.mark.parametrize("upper", [0.8, 1.1])
+def test_a_joint_that_lies_at_a_limit_is_told(tmp_path, upper):
+    t, rng = np.arange(N) / RATE, np.random.default_rng(0)
+    y = np.minimum(np.sin(2.0 * t), upper) + 3e-5 * rng.normal(size=N)
+    write_recording(tmp_path / "r.npz", {"time": t, "arm.j0.position": y})
+    facts = SceneFacts(joints={"arm.j0": JointFacts(lower=-3.0, upper=upper)})
+    found = check_recordings([read_recording(tmp_path / "r.npz")], facts)
+    sizes = [f.size for f in found if f.kind == "at_limit"]
+    share = np.mean(np.sin(2.0 * t) > upper)  # A fifth, or none.
+    assert sizes == pytest.approx([share] if share else [], abs=0.005)
+
+
 def test_nothing_is_told_of_too_little_or_of_a_constant():
     t = np.arange(30.0)
     assert relate(t, t, t, t) is None
