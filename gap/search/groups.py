@@ -73,9 +73,9 @@ def of_more_kinds(
     firsts = {r.candidate.kind: r for r in reversed(_earning(search, wide, others))}
     near = sorted(firsts.values(), key=lambda r: r.fit.score)[:ALTERNATIVES_MAX]
     found = []
-    for first in near or [None]:
-        more = [] if first is None else _and_others(search, wide, others, first)
-        wider = _pruned(search, screen, own, [*members, *more])
+    more = [_and_others(search, wide, others, first) for first in near]
+    for each in more or [[]]:
+        wider = _pruned(search, screen, own, [*members, *each])
         if wider is not None and {m.kind for m in _parts(wider.candidate)} != {kind}:
             found.append(wider)
     return found
