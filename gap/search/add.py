@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from makebreak.gap.numerics.selection import Screen, simplest
+from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Candidate, Fitted
 from makebreak.gap.result import Considered
 from makebreak.gap.search.choice import (
@@ -29,7 +29,7 @@ from makebreak.gap.search.trials import (
     shortlist,
     without_doubles,
 )
-from makebreak.gap.thresholds import EVIDENCE_MIN, SAME_ERROR
+from makebreak.gap.thresholds import EVIDENCE_MIN
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 
@@ -200,12 +200,10 @@ def _wider(
     if not search.needs_more(pick.fit):
         return None
     found = of_more_kinds(search, wide, free, of.kind)
-    trials = fit_each(search, screen, chosen, found)
-    errors = [search.error(t.fit.score) for t in trials]
-    if not trials or not min(errors) < search.enough(pick.fit.score):
-        return None
-    sizes = [t.ranked.candidate.size for t in trials]
-    return trials[simplest(errors, sizes, SAME_ERROR)]
+    for trial in fit_each(search, screen, chosen, [found] if found else []):
+        if search.error(trial.fit.score) < search.enough(pick.fit.score):
+            return trial
+    return None
 
 
 def _choices(

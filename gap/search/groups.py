@@ -21,7 +21,6 @@ from makebreak.gap.thresholds import (
     MEMBER_GAIN,
     MEMBER_Z,
     MEMBERS_MIN,
-    SAME_ERROR,
     UNEXPLAINED_RMS,
 )
 from makebreak.models.effects import KINDS
@@ -29,7 +28,6 @@ from makebreak.models.effects.kind import Effect
 
 _PLACES = ("joint", "actuator", "channel", "drive")
 # Units of what a joint may have beside what all joints have.
-ALTERNATIVES_MAX = 3  # Kinds that are tried beside all that joints may have.
 _FORCES = ("N m", "N m s/rad", "N m/rad", "kg m2")
 
 
@@ -53,14 +51,13 @@ def groups_of(found: Sequence[Candidate]) -> list[Candidate]:
 
 def of_more_kinds(
     search: Comparison, screen: Screen, free: Sequence[Candidate], kind: str
-) -> list[Ranked]:
+) -> Ranked | None:
     """A kind at many joints with all other groups of forces at joints, and what else
-    earns its place beside these, less the members that do not; several where other
-    kinds do as well as the first of what else there is, as fewer members may be needed
-    beside one of them. None where that is the kind alone."""
+    earns its place beside these, less the members that do not; None where that is the
+    kind alone."""
     groups = {g.kind: g for g in groups_of(free)}
     if kind not in groups:
-        return []
+        return None
     own = groups.pop(kind)
     members = [
         *own.members,
@@ -70,45 +67,24 @@ def of_more_kinds(
     there = {id(m) for m in members}
     others = [c for c in free if not c.members and id(c) not in there]
     wide = screen.beside(_columns_of(members)[0], FREE_TOLERANCE)
-    firsts = {r.candidate.kind: r for r in reversed(_earning(search, wide, others))}
-    near = sorted(firsts.values(), key=lambda r: r.fit.score)[:ALTERNATIVES_MAX]
-    found = []
-    more = [_and_others(search, wide, others, first) for first in near]
-    for each in more or [[]]:
-        wider = _pruned(search, screen, own, [*members, *each])
-        if wider is not None and {m.kind for m in _parts(wider.candidate)} != {kind}:
-            found.append(wider)
-    return found
-
-
-def _earning(
-    search: Comparison, wide: Screen, others: Sequence[Candidate]
-) -> list[Ranked]:
-    """Those of the candidates that do as well as the best, if that earns its place."""
-    ranked = [r for r in rank(wide, others) if r.valid]
-    errors = [search.error(r.fit.score) for r in ranked]
-    if not ranked or not errors[0] < search.enough(wide.evaluate(wide.r).score):
-        return []
-    most = (1.0 + SAME_ERROR) * errors[0]
-    return [r for r, error in zip(ranked, errors, strict=True) if error <= most]
-
-
-def _and_others(
-    search: Comparison, wide: Screen, others: Sequence[Candidate], first: Ranked
-) -> list[Candidate]:
-    """A first candidate and all that earn their place after it, one after another."""
-    found, best = [], first
+    score = search.error(wide.evaluate(wide.r).score)
     while True:
+        best = next((x for x in rank(wide, others) if x.valid), None)
+        if best is None:
+            break
+        less = search.error(best.fit.score)
+        if not less < (1.0 - search.plan.least_gain) * score:
+            break
         of, k = best.candidate, best.alternative
-        found.append(
+        members.append(
             replace(of, columns=(best.columns,), to_parameters=(of.to_parameters[k],))
         )
         others = [c for c in others if c is not of]
-        wide = wide.beside(best.columns, FREE_TOLERANCE)
-        more = _earning(search, wide, others)
-        if not more:
-            return found
-        best = more[0]
+        wide, score = wide.beside(best.columns, FREE_TOLERANCE), less
+    wider = _pruned(search, screen, own, members)
+    if wider is None or {m.kind for m in _parts(wider.candidate)} == {kind}:
+        return None
+    return wider
 
 
 def with_pruned_groups(
