@@ -77,7 +77,7 @@ def to_mjcf(scene: Scene) -> Exported:
     payloads = payloads_of(plant)
     motors = ET.Element("actuator")
     joints = [plant.get_joint(i) for i in plant.GetJointIndices()]
-    todo = [j for j in joints if not _is_added(model_of(plant, j.child_body()))]
+    todo = [j for j in joints if not is_added(model_of(plant, j.child_body()))]
     while todo:
         ready = [j for j in todo if j.parent_body().index() in elements]
         if not ready:
@@ -198,7 +198,7 @@ def _load(scene: Scene) -> LoadedScene:
     return loaded
 
 
-def _is_added(model: str) -> bool:
+def is_added(model: str) -> bool:
     """Whether load_scene has added a model for an effect (payload, elastic motor)."""
     return model.startswith(("payload_on_", "motor_of_"))
 
@@ -362,7 +362,7 @@ def to_isaac_lab(scene: Scene) -> Exported:
     groups: dict[float, dict[str, JointNumbers]] = {}
     for joint in one_dof_joints(plant):
         drive = joint_numbers(loaded, joint)
-        if drive.is_driven and not _is_added(model_of(plant, joint)):
+        if drive.is_driven and not is_added(model_of(plant, joint)):
             groups.setdefault(drive.delay, {})[re.escape(joint.name())] = drive
     if not groups:
         raise ValueError("--export isaaclab: the scene drives no joint")

@@ -42,9 +42,19 @@ from makebreak.models.effects.actuation_path import (
     TIME_CONSTANT,
 )
 from makebreak.models.effects.contact import CONTACT_LAW, FRICTION
-from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
+from makebreak.models.effects.kind import (
+    Effect,
+    full_name,
+    model_of,
+    one_dof_joints,
+)
 from makebreak.models.mjcf import named_spec, rotation
-from makebreak.models.model_export import inertial_of, joint_numbers, payloads_of
+from makebreak.models.model_export import (
+    inertial_of,
+    is_added,
+    joint_numbers,
+    payloads_of,
+)
 from makebreak.models.model_files import with_what_files_say
 from makebreak.models.robot_file import path_of
 from makebreak.models.scene import LoadedScene, Scene, actuators_of_model, load_scene
@@ -84,6 +94,7 @@ class MujocoTwin:
         if path is None or path.suffix != ".xml" or scene.fixed_joints:
             raise ValueError("MuJoCo simulates scenes of one MJCF file alone")
         self._spec, self._writer = named_spec(path)
+        self._spec.compiler.discardvisual = True  # Meshes are not made again.
         self._file = with_what_files_say(replace(scene, effects=[]))
         self._of_file = {e.key for e in self._file.effects}
         self._plain = _Numbers(load_scene(self._file, DiagramBuilder()))
@@ -170,7 +181,8 @@ class MujocoTwin:
                 continue
             body = spec.body(name)
             body.explicitinertial, body.mass = True, inertial[0]
-            body.ipos, body.fullinertia = inertial[1:4], inertial[4:]
+            body.ipos, body.inertia = inertial[1:4], np.zeros(3)
+            body.fullinertia = inertial[4:]
             body.ialt.type, body.iquat = 0, [1.0, 0.0, 0.0, 0.0]
 
     def _set_shapes(self, spec, now: "_Numbers") -> None:
@@ -262,7 +274,7 @@ class _Numbers:
         for k in range(1, plant.num_bodies()):
             body = plant.get_body(BodyIndex(k))
             own = inertial_of(body, payloads)
-            if own.mass > 0.0:
+            if own.mass > 0.0 and not is_added(model_of(plant, body)):
                 six = own.central[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
                 self.inertials[body.name()] = np.array([own.mass, *own.com, *six])
             fixed = plant.IsAnchored(body)

@@ -398,10 +398,14 @@ def by_content(
 
 def _without_empty(columns, matches: Sequence[Match], said) -> list[Match]:
     """Without efforts and commands that stay the same while their joint moves; another
-    column of the same channel takes their place."""
+    column of the same channel takes their place. A joint that is held follows a command
+    that stays the same, as near as others follow theirs."""
     position = {
         m.channel: m for m in matches if (m.channel or "").endswith(".position")
     }
+    follows = _follows(columns, matches, position)
+    others = [off for name, off in follows.items() if _range(columns[name]) > 0.0]
+    near = max(others, default=0.0)
     out = list(matches)
     for k, match in enumerate(matches):
         at, _, what = (match.channel or "").rpartition(".")
@@ -414,6 +418,8 @@ def _without_empty(columns, matches: Sequence[Match], said) -> list[Match]:
         moves = own is not None and _range(_si(columns, own)) > GIVES_WAY
         if len(y) and (np.ptp(y) > 0.0 or not moves) or match.why == AS_SAID:
             continue
+        if follows.get(match.column, np.inf) <= near:
+            continue
         why = "empty" if not len(y) else f"{y[0]:.4g} throughout while the joint moves"
         out[k] = replace(match, channel=None, why=f"{what}: {why}, so it is no drive")
         says = f"Column {match.column} is {why}: it is not what drives {at}."
@@ -424,6 +430,19 @@ def _without_empty(columns, matches: Sequence[Match], said) -> list[Match]:
                 out[j] = replace(other, channel=other.may, may="", why=why)
                 break
     return out
+
+
+def _follows(columns, matches: Sequence[Match], position) -> dict[str, float]:
+    """{column of position commands: how far from it its joint is, rms}."""
+    found = {}
+    for match in matches:
+        at, _, what = (match.channel or "").rpartition(".")
+        own = position.get(f"{at}.position")
+        if what == "position_command" and own is not None:
+            off = _si(columns, own) - _si(columns, match)
+            if (there := off[np.isfinite(off)]).size:
+                found[match.column] = float(np.sqrt(np.mean(there**2)))
+    return found
 
 
 # ----- Whose column it is

@@ -8,7 +8,7 @@ what contacts that chatter do by chance.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import product
+from functools import partial
 
 import numpy as np
 
@@ -17,15 +17,18 @@ from makebreak.gap.data.recording import Recording
 from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.problem import Candidate, Fitted, Nuisances, SearchPlan, rms
 from makebreak.gap.residuals.impacts import candidates_of, kinds_of_joints, tried
+from makebreak.gap.residuals.mechanism_candidates import loads
 from makebreak.gap.residuals.objects import MOST_EFFECTS, WindowedProblem
 from makebreak.gap.simulation.mujoco_simulation import MujocoSimulation
 from makebreak.gap.simulation.windows import LARGEST, Window, WindowModel, seen_in
 from makebreak.gap.thresholds import UNEXPLAINED_RMS
+from makebreak.models.effects import KINDS
 from makebreak.models.effects.ground import PLACE
-from makebreak.models.effects.kind import Effect
+from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
 from makebreak.models.scene import Scene
 
 WINDOW_SEC, MOST = 0.6, 60
+MOST_MOVES = 16  # Of starts, to know what their uncertainty does.
 # Variance between two runs whose contacts chatter by chance, over that of what is bent.
 CHANCE = 1.33
 # Of a row, by which commands may act before it; and the error with that, to be so.
@@ -46,7 +49,7 @@ class MujocoProblem(WindowModel, WindowedProblem):
     """
 
     plan = SearchPlan(
-        evaluations=10, diff_step=5e-3, least_gain=0.05, most_effects=MOST_EFFECTS,
+        evaluations=8, diff_step=5e-3, least_gain=0.05, most_effects=MOST_EFFECTS,
         jumps=True, loud=UNEXPLAINED_RMS,
     )  # fmt: skip
 
@@ -159,11 +162,16 @@ class MujocoProblem(WindowModel, WindowedProblem):
         kept, self._base = self.windows, None
         plain = self.simulate(effects)
         moved, bent = [], [np.zeros_like(y) for y in plain]
+        axes = 2 * len(kept[0].state)
+        moves = np.eye(axes)
+        if axes > MOST_MOVES:  # So many at random have the same covariance.
+            rng = np.random.default_rng(0)
+            moves = rng.normal(size=(MOST_MOVES, axes)) / np.sqrt(MOST_MOVES)
         try:
-            for name, k in product(kept[0].state, (0, 1)):
+            for by in moves:
                 pair = []
                 for sign in (1.0, -1.0):
-                    self.windows = [_moved(w, name, k, sign) for w in kept]
+                    self.windows = [_moved(w, sign * by) for w in kept]
                     pair.append(self.simulate(effects))
                 # What is straight in it, and what is bent.
                 moved.append([0.5 * (a - b) for a, b in zip(*pair, strict=True)])
@@ -178,7 +186,7 @@ class MujocoProblem(WindowModel, WindowedProblem):
         own = np.sqrt(self.noise**2 + (BLUR * far) ** 2)
         self._own, self._start = [], []
         for k, w in enumerate(kept):
-            mine = np.sqrt(own**2 + CHANCE * bent[k] / (len(moved) / 2))
+            mine = np.sqrt(own**2 + CHANCE * bent[k] / len(moves))
             self._own.append(mine)
             by = np.stack([y[k] / mine for y in moved], axis=-1)
             by = np.nan_to_num(by, posinf=0.0, neginf=0.0)
@@ -249,16 +257,34 @@ class MujocoProblem(WindowModel, WindowedProblem):
 
     def candidates(self, nuisances: Nuisances, current: Fitted) -> list[Candidate]:
         found = super().candidates(nuisances, current)
-        return found + candidates_of(self, kinds_of_joints(self), current)
+        found += candidates_of(self, kinds_of_joints(self), current)
+        return found + loads(
+            self.dynamics, {(e.kind, at) for e in current.effects for at in e.at},
+            current.r, partial(tried, self, *current.effects), self._carriers,
+        )  # fmt: skip
+
+    def _carriers(self, kind: str) -> list[str]:
+        """Bodies that joints join; less those that are free, of which it is asked what
+        they are themselves, where the kind is that."""
+        joints = one_dof_joints(self.dynamics.plant)
+        joined = {
+            full_name(self.dynamics.plant, body)
+            for j in joints for body in (j.parent_body(), j.child_body())
+        }  # fmt: skip
+        own = self.bodies if KINDS[kind].tolerance is not None else ()
+        return [at for at in self.dynamics.links() if at in joined and at not in own]
 
 
-def _moved(w: Window, name: str, k: int, sign: float) -> Window:
-    """The window from a start moved by one deviation along an axis of the uncertainty
-    of a signal's value and rate."""
-    values, u = np.linalg.eigh(w.spread[name])
-    x = np.array(w.state[name])
-    x[:2] += sign * u[:, k] * np.sqrt(max(values[k], 0.0))
-    return replace(w, state={**w.state, name: x})
+def _moved(w: Window, by: np.ndarray) -> Window:
+    """The window from another start: by (2 k,), in deviations, along the axes of the
+    uncertainty of each of k signals' value and rate."""
+    state = dict(w.state)
+    for d, (name, x) in zip(by.reshape(-1, 2), w.state.items(), strict=True):
+        if d.any():
+            values, u = np.linalg.eigh(w.spread[name])
+            state[name] = x = np.array(x)
+            x[:2] += u @ (d * np.sqrt(np.maximum(values, 0.0)))
+    return replace(w, state=state)
 
 
 def contacts_of_mujoco(problem: MujocoProblem) -> Finding:
