@@ -42,6 +42,7 @@ from makebreak.models.drives import (
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.actuation_path import SHARE, TIME_CONSTANT, PathPorts
 from makebreak.models.effects.body_forces import BodyForces
+from makebreak.models.effects.change_shape import bound_half_spaces
 from makebreak.models.effects.delay_line import DelayLine, LagLine
 from makebreak.models.effects.joint_forces import JointForces
 from makebreak.models.effects.kind import (
@@ -335,6 +336,7 @@ def load_scene(
         plant.Finalize()
     except DRAKE_ERRORS as error:  # Such as a loop of welds.
         raise ValueError(f"scene's directives: {one_line(error)}") from None
+    bound_half_spaces(plant, scene_graph)
     for effect in effects:
         possible = KINDS[effect.kind].possible
         if possible is not None:

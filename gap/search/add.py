@@ -192,10 +192,12 @@ def _wider(
     free: Sequence[Candidate], pick: Trial,
 ) -> Trial | None:  # fmt: skip
     """What many joints have, with all else that joints may have, where that leaves
-    clearly less."""
+    clearly less. Of simulated windows columns tell too little of so many at once."""
     wide, screen = screens
     of = pick.ranked.candidate
     if of.kind not in KINDS or not (of.members or len(of.at) > 1):
+        return None
+    if not search.problem.by_equations:
         return None
     if not search.needs_more(pick.fit):
         return None

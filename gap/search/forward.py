@@ -100,21 +100,31 @@ def _step(search: Comparison, rivals: Rivals, path: Path) -> Path:
     more = sum(c.size for c in step.added)
     if step.fitted is None or not search.is_needed(step.fitted, current, more):
         return replace(path, table=path.table or step.table, ended=True)
-    chosen = [*path.end.chosen, *step.added]
-    current = _converged(search, chosen, step.fitted)
+    chosen = refreshed([*path.end.chosen, *step.added], step.fitted)
+    current = step.fitted
+    if search.plan.jumps:  # By its own weights it may be done.
+        chosen, current = reweighed(search, chosen, current)
+    current = _converged(search, chosen, current)
     chosen = refreshed(chosen, current)  # The next fit starts from here.
-    with search.budget.held():
-        if problem.reweigh(current):
-            # Less is left than models were taken to be off by, or noise is another in
-            # them.
-            search.start_again()
-            current = search.refit(chosen, current)
-            chosen = refreshed(chosen, current)
+    chosen, current = reweighed(search, chosen, current)
     for of in (merge, refine):
         chosen, current = search.if_time(
             "improving the last effects", partial(of, search), chosen, current
         )
     return path.plus(State(tuple(chosen), current), step.table)
+
+
+def reweighed(
+    search: Comparison, chosen: list[Choice], current: Fitted
+) -> tuple[list[Choice], Fitted]:
+    """By the weights of what is chosen, fitted again where those are others: less is
+    left than models were taken to be off by, or noise is another in them; or those of a
+    branch that was given up, or of an effect that was dropped, are left."""
+    with search.budget.held():
+        if search.problem.reweigh(current):
+            search.start_again()
+            current = search.refit(chosen, current) if chosen else search.start
+    return refreshed(chosen, current), current
 
 
 def _converged(search: Comparison, chosen: Sequence[Choice], current: Fitted) -> Fitted:

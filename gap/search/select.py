@@ -35,7 +35,7 @@ from makebreak.gap.search.choice import (
 )
 from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.search.drop import drop_needless, keep_certain, simplify
-from makebreak.gap.search.forward import forward
+from makebreak.gap.search.forward import forward, reweighed
 from makebreak.gap.search.rivals import (
     still_tied,
     with_rivals_of_pairs,
@@ -52,7 +52,7 @@ def select(
     whatever is not needed any more is dropped."""
     search = Comparison(problem, say)
     path = forward(search)
-    chosen, current = _reweighed(search, list(path.end.chosen), path.end.fitted)
+    chosen, current = reweighed(search, list(path.end.chosen), path.end.fitted)
     with search.budget.part(PRUNE):
         chosen, current = _pruned(search, chosen, current)
         chosen = search.budget.if_time(
@@ -79,7 +79,7 @@ def _pruned(
             chosen, current = search.if_time(
                 what, partial(step, search), chosen, current
             )
-    return _reweighed(search, chosen, current)
+    return reweighed(search, chosen, current)
 
 
 def _with_ties(
@@ -93,19 +93,6 @@ def _with_ties(
     ]
     chosen = with_shared_gains(search, chosen, current)
     return with_rival_sets(search, chosen, current)
-
-
-def _reweighed(
-    search: Comparison, chosen: list[Choice], current: Fitted
-) -> tuple[list[Choice], Fitted]:
-    """By the weights of what is chosen: those of a branch that was given up, or of an
-    effect that was dropped, may be left."""
-    with search.budget.held():
-        if not search.problem.reweigh(current):
-            return chosen, current
-        search.start_again()
-        current = search.refit(chosen, current) if chosen else search.start
-    return refreshed(chosen, current), current
 
 
 def without(problem: GapProblem, selection: Selection, *effects: Effect) -> Selection:
