@@ -24,6 +24,7 @@ BENT, STRAIGHT, NOTHING = 0.1, 1e-2, 1e-6
 # looks where that ended.
 WANDER, AROUND = 0.2, 0.5
 MOST_FAR = 450  # Simulations, about.
+MOST_FREE = 6  # Parameters of a search without slopes.
 ROUGH = np.linspace(0.85, 1.15, 16)  # Of a start, tried.
 
 
@@ -315,14 +316,17 @@ def derivative_free_search(
     fixed: Sequence[Sequence[str]],
     far: bool = False,
     most: int = 200,
-) -> tuple[Effect, ...]:
+) -> tuple[Effect, ...] | None:
     """Effects from which a fit may go on where its gradient misled it: when which foot
-    lands first changes, the error jumps, and slopes tell little.
+    lands first changes, the error jumps, and slopes tell little. None: of so many
+    parameters no such search tells anything.
 
     Nelder and Mead's search, of `most` simulations; `far`, differential evolution,
     which leaves valleys.
     """
     free = _Free(problem, start, [tuple(names) for names in fixed])
+    if len(free.names) > MOST_FREE:
+        return None
 
     def cost(z) -> float:
         go_on()

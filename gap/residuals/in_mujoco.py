@@ -50,7 +50,7 @@ class MujocoProblem(WindowModel, WindowedProblem):
 
     plan = SearchPlan(
         evaluations=8, diff_step=5e-3, least_gain=0.05, most_effects=MOST_EFFECTS,
-        jumps=True, loud=UNEXPLAINED_RMS,
+        jumps=True, alike=True, loud=UNEXPLAINED_RMS,
     )  # fmt: skip
 
     def __init__(

@@ -136,12 +136,14 @@ def _converged(search: Comparison, chosen: Sequence[Choice], current: Fitted) ->
         if not search.needs_more(current):
             break
         screen = search.screen(current.r, current.fit.train)
-        effects = current.effects
+        effects: tuple[Effect, ...] | None = current.effects
         try:
             if jumps:
                 effects = derivative_free_search(
-                    search.problem, screen, effects, fixed, far
+                    search.problem, screen, current.effects, fixed, far
                 )
+            if effects is None:
+                break
             more = fit_effects(search.problem, screen, effects, fixed, steps)
         except Stopped:
             search.budget.leave("the last fit to its end")

@@ -128,6 +128,8 @@ def _search_finalists(
             effects = derivative_free_search(
                 search.problem, screen, fit.effects, fixed, most=FINALIST_SIMULATIONS
             )
+            if effects is None:
+                continue
             better = fit_effects(search.problem, screen, effects, fixed)
         except ValueError:
             continue
