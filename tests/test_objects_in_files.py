@@ -136,6 +136,19 @@ def test_ctrl_counts_actuators_and_not_joints(tmp_path):
     assert own["ctrl[1]"] == "w.px.position_command"
 
 
+@pytest.mark.parametrize(("far", "drives"), [(0.3, True), (6.0, False)])
+def test_a_command_that_holds_its_joint_is_a_command(tmp_path, far, drives):
+    """A joint stays as near to a command that is 0 throughout as others to theirs; one
+    that goes far from it is not driven by it."""
+    late = np.interp(T - 0.5, T, swing(1))
+    columns = {"time": T, "qpos[0]": late, "qpos[1]": far * swing(2)}
+    columns |= {"ctrl[0]": 0 * T, "ctrl[1]": swing(1)}
+    _, own, _ = proposed(tmp_path, mjcf(FINGER, SERVOS), columns)
+    assert own["ctrl[1]"] == "w.px.position_command"
+    held = own["ctrl[0]"]
+    assert (held == "w.py.position_command") == drives, held
+
+
 @pytest.mark.parametrize(
     ("names", "scale"),
     [
@@ -339,3 +352,53 @@ def test_a_ball_of_another_size_is_named_by_windows_of_mujoco(tmp_path):
     assert (named.kind, list(named.at)) == ("object_size", ["w.ball"])
     assert named.parameters["radius"].value == pytest.approx(0.034, abs=1e-4)
     assert "mujoco_contacts" in {check.kind for check in result.checks}
+
+
+def test_what_a_legged_robot_carries_is_named_by_windows_of_mujoco(tmp_path):
+    """It stands on three legs that slide, of which one is held: a command that stays
+    the same is a command."""
+    legs = "".join(
+        f'<body name="leg{k}" pos="{x} {y} 0"><joint name="leg{k}" type="slide" '
+        'axis="0 0 1" damping="20" armature=".2"/><geom type="capsule" size=".02" '
+        'fromto="0 0 0 0 0 -.3" mass=".3" friction="1"/></body>'
+        for k, (x, y) in enumerate([(0.35, 0.3), (0.35, -0.3), (-0.4, 0.0)])
+    )
+    drives = "".join(f'<position joint="leg{k}" kp="3000"/>' for k in range(3))
+    text = (
+        '<mujoco model="w"><worldbody><geom name="floor" type="plane" size="3 3 .1"/>'
+        '<body name="trunk" pos="0 0 .32"><freejoint/><inertial pos="0 0 0" mass="3" '
+        f'diaginertia=".02 .04 .05"/>{{}}{legs}</body></worldbody><actuator>{drives}'
+        "</actuator></mujoco>"
+    )
+    load = '<body pos=".08 0 .06"><geom size=".03" mass=".8" contype="0"/></body>'
+    model = mujoco.MjModel.from_xml_string(text.format(load))
+    data = mujoco.MjData(model)
+    rows = []
+    for step in range(2500):
+        t = np.floor((data.time + 1e-9) * 125) / 125
+        on = min(t, 1.0)
+        data.ctrl[:] = on * np.array([0.03 * np.sin(5 * t), 0.02 * np.sin(4 * t), 0])
+        if step % 2 == 0 and step >= 500:
+            rows.append([data.time, *data.qpos, *data.ctrl])
+        mujoco.mj_step(model, data)
+    table = np.array(rows)
+    table[:, 1:11] += 1e-4 * np.random.default_rng(4).normal(size=(len(table), 10))
+    np.savez(
+        tmp_path / "log.npz", time=table[:, 0], qpos=table[:, 1:11], ctrl=table[:, 11:]
+    )
+    (tmp_path / "w.xml").write_text(text.format(""))
+    robot, log = tmp_path / "w.xml", tmp_path / "log.npz"
+    names = [f"qpos[{k}]" for k in range(10)] + [f"ctrl[{k}]" for k in range(3)]
+    columns = dict(zip(["time", *names], table.T, strict=True))
+    read = RecordingTable(columns, np.arange(len(table)) + 1, len(table))
+    found = propose_scene(read_robot(robot), [Log(log, read)])
+    (tmp_path / "scene.yaml").write_text(found.scene)
+    (tmp_path / "log.yaml").write_text(found.sidecars[log])
+    assert "w.leg2" in found.scene
+    result = run_gap(tmp_path / "scene.yaml", [log])
+    assert result.verdict == "gap_named", result.says
+    (named,) = result.effects
+    assert (named.kind, list(named.at)) == ("payload", ["w.trunk"])
+    for name, value in (("mass", 0.8), ("com_x", 0.08), ("com_z", 0.06)):
+        of = named.parameters[name]
+        assert of.value == pytest.approx(value, abs=max(3.0 * of.std, 0.01))

@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pydrake.geometry import Box, HalfSpace
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
@@ -347,3 +348,40 @@ def test_initial_velocities_act_in_a_session(ball_scene, tmp_path):
         session.finish()
     np.testing.assert_allclose(log["state"][:, -3], 1.5, rtol=1e-12)
     np.testing.assert_allclose(log["state"][-1, 4], 1.5 * 0.2, rtol=1e-9)
+
+
+@pytest.mark.parametrize("legs", [3, 20])
+def test_half_spaces_among_many_shapes_are_large_boxes(tmp_path, legs):
+    """Of few they stay: Drake's tree of these is never made anew."""
+    links = "".join(
+        f'<link name="leg{k}"><inertial><mass value="0.1"/><inertia ixx="1e-3" '
+        'ixy="0" ixz="0" iyy="1e-3" iyz="0" izz="1e-3"/></inertial><collision>'
+        '<geometry><sphere radius="0.02"/></geometry></collision></link>'
+        f'<joint name="j{k}" type="revolute"><parent link="base"/>'
+        f'<child link="leg{k}"/><origin xyz="{k} 0 0"/><axis xyz="0 1 0"/><limit lower="-1" upper="1" '
+        'effort="9" velocity="9"/></joint>'
+        for k in range(legs)
+    )
+    (tmp_path / "robot.urdf").write_text(
+        f'<robot name="robot"><link name="base"/>{links}</robot>'
+    )
+    (tmp_path / "floor.sdf").write_text(
+        '<sdf version="1.9"><model name="floor"><static>1</static><link name="floor">'
+        '<pose>0 0 -1 0 0 0</pose><collision name="c"><geometry><plane><normal>0 0 1'
+        "</normal></plane></geometry></collision></link></model></sdf>"
+    )
+    (tmp_path / "scene.yaml").write_text(
+        "directives:\n- add_model: {name: robot, file: robot.urdf}\n"
+        "- add_weld: {parent: world, child: robot::base}\n"
+        "- add_model: {name: floor, file: floor.sdf}\n"
+    )
+    loaded = load_scene(tmp_path / "scene.yaml", DiagramBuilder())
+    inspector = loaded.scene_graph.model_inspector()
+    (floor,) = loaded.plant.GetCollisionGeometriesForBody(
+        loaded.plant.GetBodyByName("floor")
+    )
+    shape, X = inspector.GetShape(floor), inspector.GetPoseInFrame(floor)
+    assert isinstance(shape, HalfSpace if legs < 14 else Box)
+    top = X.translation()[2] + (0.5 * shape.height() if legs > 14 else 0.0)
+    assert top == pytest.approx(0.0)
+    assert inspector.GetProximityProperties(floor) is not None

@@ -264,14 +264,16 @@ class MujocoProblem(WindowModel, WindowedProblem):
         )  # fmt: skip
 
     def _carriers(self, kind: str) -> list[str]:
-        """Bodies that joints join; less those that are free, of which it is asked what
-        they are themselves, where the kind is that."""
+        """Bodies that joints join; less those that are free where the kind is of what
+        these are asked for themselves."""
         joints = one_dof_joints(self.dynamics.plant)
         joined = {
             full_name(self.dynamics.plant, body)
             for j in joints for body in (j.parent_body(), j.child_body())
         }  # fmt: skip
-        own = self.bodies if KINDS[kind].tolerance is not None else ()
+        names = [p.name for p in KINDS[kind].parameters]
+        asked = [[p.name for p in e.parameters] for e in KINDS.values() if e.absolute]
+        own = self.bodies if names in asked else ()
         return [at for at in self.dynamics.links() if at in joined and at not in own]
 
 
