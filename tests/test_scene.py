@@ -358,7 +358,8 @@ def test_half_spaces_among_many_shapes_are_large_boxes(tmp_path, legs):
         'ixy="0" ixz="0" iyy="1e-3" iyz="0" izz="1e-3"/></inertial><collision>'
         '<geometry><sphere radius="0.02"/></geometry></collision></link>'
         f'<joint name="j{k}" type="revolute"><parent link="base"/>'
-        f'<child link="leg{k}"/><origin xyz="{k} 0 0"/><axis xyz="0 1 0"/><limit lower="-1" upper="1" '
+        f'<child link="leg{k}"/><origin xyz="{k} 0 0"/><axis xyz="0 1 0"/>'
+        '<limit lower="-1" upper="1" '
         'effort="9" velocity="9"/></joint>'
         for k in range(legs)
     )
