@@ -192,14 +192,12 @@ def _wider(
     free: Sequence[Candidate], pick: Trial,
 ) -> Trial | None:  # fmt: skip
     """What many joints have, with all else that joints may have, where that leaves
-    clearly less. Of simulated windows columns tell too little of so many at once."""
+    clearly less. Where errors jump, columns tell too little of so many."""
     wide, screen = screens
     of = pick.ranked.candidate
     if of.kind not in KINDS or not (of.members or len(of.at) > 1):
         return None
-    if not search.problem.by_equations:
-        return None
-    if not search.needs_more(pick.fit):
+    if search.plan.jumps or not search.needs_more(pick.fit):
         return None
     found = of_more_kinds(search, wide, free, of.kind)
     for trial in fit_each(search, screen, chosen, [found] if found else []):
