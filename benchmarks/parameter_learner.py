@@ -220,7 +220,7 @@ LEG = Task(
 
 def box_world(v: dict) -> str:
     mu, half = v["friction"], 0.04 - v["gap"]
-    shapes = p.shape("sides", p.box(2 * half, 2 * half, 0.05), mu=mu)
+    shapes = p.shape("sides", p.box(2 * half, 2 * half, 0.04), mu=mu)
     shapes += p.feet(0.06, -0.021, 0.004, mu)
     text = p.ground(mu) + p.finger("tip", p.XY, "0 0 0.025", 0.02, 0.3, damping=2.0)
     return p.sdf(text, p.link("box", v["mass"], shapes, arm=0.027))

@@ -144,7 +144,7 @@ class PushParametersConfig:
     gap: float = 0.004  # Deviation of the distance of tip and object [m].
     # Deviation of the object's centre of mass along x and along y [m].
     com: float = 0.0
-    # Weights Q_d of the tip's velocities, and of the object's along x and y [s2/m2].
+    # Weights Q_d of the tip's velocities, and of the object's [s2/m2].
     weight: float = 4e3
     # Radius at which the object's turning counts with the same weight [m].
     turn_radius: float = 0.05
@@ -330,7 +330,6 @@ def parameter_learner_config(
     """Config of the learner of these parameters of contact_pairs."""
     pairs = [replace(pairs[0], anisotropy=LEANING), *pairs[1:]]
     Q_d = np.zeros(N_X)
-    Q_d[V_TIP] = own.weight
-    Q_d[V_BALL.start : V_BALL.start + 2] = own.weight
-    Q_d[W_BALL.start + 2] = own.weight * own.turn_radius**2
+    Q_d[V_TIP] = Q_d[V_BALL] = own.weight  # It stays on the table, too.
+    Q_d[W_BALL] = own.weight * own.turn_radius**2
     return ParameterLearnerConfig(pairs, items, Q_d.tolist(), own.contact_std)

@@ -27,6 +27,7 @@ from makebreak.systems.contact_mpc.numerics.ball_state import (
     P_TIP,
     V_BALL,
     V_TIP,
+    W_BALL,
 )
 from makebreak.systems.contact_mpc.numerics.lcs import LCS, simulate
 from makebreak.systems.contact_mpc.numerics.parameter_posterior import (
@@ -34,6 +35,7 @@ from makebreak.systems.contact_mpc.numerics.parameter_posterior import (
     Loss,
     Sample,
     Scale,
+    acting,
     certain_part,
     drifted,
     error_weights,
@@ -260,7 +262,7 @@ def sliding(mass, friction_force=0.0):
 
 def test_without_contact_it_is_the_kalman_filter():
     """A mass by its inverse z: v_next is linear in it, so the update is exact."""
-    loss = Loss(np.diag([0.0, 400.0]), 1.0, 1e-4, np.inf)
+    loss = Loss(np.diag([0.0, 400.0]), 1.0, 1e-4)
     u, dt = np.array([2.0]), 0.1
     belief, information, mean = prior(1), 1.0, 0.0
     rng = np.random.default_rng(0)
@@ -294,7 +296,7 @@ def test_a_damping_takes_what_was_moved_whatever_the_speed_was_meanwhile():
     A[1, 1] -= dt * damping
     lcs = replace(lcs, A=A)
     sample = Sample(x_now, np.zeros(1), x_next, np.array([moved / dt]), np.eye(1))
-    lacks, _ = step_of(lcs, sample, Loss(np.eye(2), 1.0, 1e-4, np.inf))
+    lacks, _ = step_of(lcs, sample)
     assert abs(lacks[1]) < 1e-12
 
 
@@ -316,7 +318,7 @@ def test_the_gradient_of_the_loss_agrees_with_finite_differences(task):
     u = rng.normal(size=model.n_u)
     x_next = x + 0.01 * rng.normal(size=model.n_x)
     sample = Sample(x, u, x_next, *model.between(x, x_next))
-    loss = Loss(np.diag([0.0] * 3 + [1e4] * 3), 0.5, 0.5 * model.eps_c, np.inf)
+    loss = Loss(np.diag([0.0] * 3 + [1e4] * 3), 0.5, 0.5 * model.eps_c)
     values = p.nominal.copy()
     values[-1] = -0.9  # [m] so deep that there is force.
 
@@ -378,6 +380,180 @@ def test_scale_and_its_slopes():
     np.testing.assert_allclose(values, [2.0 * np.exp(0.35), 0.09])
     slope = (scale.values(z + 1e-6) - scale.values(z - 1e-6)) / 2e-6
     np.testing.assert_allclose(scale.slopes(values), slope, rtol=1e-6)
+
+
+# What slides.
+
+BOX_MU = 0.4
+
+
+def sliding_box(velocity, next_velocity=None, friction=BOX_MU, item=None, **settings):
+    """A learner of a box of push_object alone on its supports, exact but for noise; the
+    LCS of a step in which it slides, and the step."""
+    spec = PushedObject("box")
+    pairs = contact_pairs(spec, friction)[1:]
+    items = [item or Parameter("friction", 0.5, pairs=list(range(len(pairs))))]
+    Q_d = np.zeros(N_X)
+    Q_d[V_BALL] = 1e4
+    learner = ParameterLearner(
+        make_tip_and_object(spec)[0],
+        ParameterLearnerConfig(pairs, items, Q_d.tolist(), **settings),
+        0.05,
+    )
+    return learner, box_step(learner, velocity, next_velocity)
+
+
+def box_step(learner, velocity, next_velocity=None):
+    ends = np.tile(learner.model.x_default, (2, 1))
+    ends[:, P_BALL], ends[:, P_TIP] = [0.0, 0.0, 0.02], [1.0, 1.0, 0.5]
+    ends[:, V_BALL] = velocity, velocity if next_velocity is None else next_velocity
+    ends[1, P_BALL] += 0.05 * ends[:, V_BALL].mean(axis=0)
+    return Sample(ends[0], np.zeros(3), ends[1], *learner.model.between(*ends))
+
+
+@pytest.mark.parametrize("degrees", [0.0, 13.0, 22.5, 200.0])
+def test_the_force_of_what_slides_is_on_the_exact_cone_against_the_slip(degrees):
+    way = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees)), 0.0])
+    learner, sample = sliding_box(0.5 * way)
+    lcs = learner.model.build(sample.x, sample.u)
+    mu = np.full(lcs.n_lam, BOX_MU)
+    acts = acting(lcs, sample, mu, 1e-6)
+    assert acts.slides.all() and acts.ways.shape[1] == len(np.unique(lcs.contact))
+    push = lcs.J.T @ acts.ways
+    np.testing.assert_allclose(push[V_BALL.start - learner.model.n_q :].T,
+                               np.tile([0.0, 0.0, 1.0] - BOX_MU * way, (3, 1)),
+                               atol=1e-9)  # fmt: skip
+    np.testing.assert_allclose((lcs.J.T @ acts.rows)[-3:].T, 3 * [[0, 0, 1]], atol=1e-9)
+    at_rest = acting(lcs, sliding_box(0.0 * way)[1], mu, 0.02)
+    assert not at_rest.slides.any() and at_rest.ways.shape == (lcs.n_lam,) * 2
+
+
+def test_the_errors_of_a_sliding_force_are_those_of_a_noisy_slip():
+    """Directions of 10^5 slips that were measured with a fifth of noise each way: mean,
+    and deviations across and along it, to the next order of the angle."""
+    rng, noise = np.random.default_rng(0), 0.1
+    slips = [0.5, 0.0] + noise * rng.normal(size=(100_000, 2))
+    unit = slips / np.linalg.norm(slips, axis=1)[:, None]
+    learner, sample = sliding_box([0.5, 0.0, 0.0])
+    lcs = learner.model.build(sample.x, sample.u)
+    acts = acting(lcs, sample, np.full(lcs.n_lam, BOX_MU), noise)
+    force = lcs.J[:, V_BALL.start - learner.model.n_q :][:, :2] / BOX_MU
+    assert (force.T @ acts.ways)[0, 0] == pytest.approx(-unit[:, 0].mean(), rel=1e-2)
+    across, along = (abs(force.T @ each)[:, 0] for each in acts.errors)
+    assert across[1] == pytest.approx(unit[:, 1].std(), rel=0.05)
+    assert along[0] == pytest.approx(unit[:, 0].std(), rel=0.15)
+
+
+def test_a_slip_that_starts_or_ends_in_a_step_is_not_certain():
+    learner, sample = sliding_box([0.5, 0.0, 0.0], [0.4, 0.0, 0.0])
+    lcs = learner.model.build(sample.x, sample.u)
+    for ends, slides in (((0.5, 0.4), True), ((0.5, 0.0), False), ((0.0, 0.5), False)):
+        sample = box_step(learner, *([v, 0.0, 0.0] for v in ends))
+        acts = acting(lcs, sample, np.full(lcs.n_lam, BOX_MU), 1e-3)
+        assert acts.slides.all() == acts.slides.any() == slides
+
+
+def test_a_sliding_step_tells_of_friction_what_a_closed_form_says():
+    """dv = -mu g dt with the noise of dv: information (mu g dt / noise)^2 of ln(mu). It
+    was nothing where the force was spread over three edges."""
+    before = 0.5 - BOX_MU * 9.81 * 0.05
+    for degrees in (0.0, 10.0, 22.5):
+        way = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees)), 0.0])
+        learner, sample = sliding_box(
+            0.5 * way, before * way, error_share=0.0, trust=1.0, slip_noise=1e-4,
+            contact_std=1e-3,
+        )  # fmt: skip
+        belief, _ = learner._learned(prior(1), sample)
+        told = (BOX_MU * 9.81 * 0.05 * 0.5) ** 2 * 1e4  # Of z, of which one is 0.5.
+        # The turn of the slip in the step and the supports' softness take a little.
+        assert belief.information[0, 0] - 1.0 == pytest.approx(told, rel=0.03)
+
+
+def test_the_interval_of_what_slides_holds_as_often_as_it_says():
+    """A hundred worlds whose friction is drawn from the prior, eight steps each with
+    10 mm/s of noise in the change of the velocity."""
+    rng, inside = np.random.default_rng(0), []
+    learner, _ = sliding_box(
+        [0.5, 0.0, 0.0], error_share=0.0, trust=1.0, slip_noise=0.01
+    )
+    for _ in range(100):
+        mu, belief = BOX_MU * np.exp(0.5 * rng.normal()), prior(1)
+        for _ in range(8):
+            angle, speed = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(1.5, 2.0)
+            way = np.array([np.cos(angle), np.sin(angle), 0.0])
+            after = (speed - mu * 9.81 * 0.05) * way
+            after[:2] += 0.01 * rng.normal(size=2)
+            belief, _ = learner._learned(belief, box_step(learner, speed * way, after))
+        off = (belief.mean - np.log(mu / BOX_MU) / 0.5) / belief.std
+        inside.append(abs(off[0]) < 1.645)
+    assert 0.85 <= np.mean(inside) <= 0.95
+
+
+def test_noise_at_rest_tells_nothing():
+    """The value went down by 1 % a step, as what a slip's noise costs is less with a
+    smaller mass."""
+    rng = np.random.default_rng(0)
+    learner, _ = sliding_box([0.0] * 3, item=Parameter("mass", 0.5, "object"))
+    belief = prior(1)
+    for _ in range(40):
+        ends = 0.008 * rng.normal(size=(2, 3)) * [1.0, 1.0, 0.0]
+        belief, _ = learner._learned(belief, box_step(learner, *ends))
+    assert abs(belief.mean[0]) < 0.02 and belief.std[0] > 0.98
+
+
+def test_a_cone_that_is_not_round_leaves_the_force_along_its_first_axis_free():
+    """As of a finger that leans: across, against the slip; up and down, either way."""
+    spec = PushedObject("box")
+    pair = replace(contact_pairs(spec, BOX_MU)[0], anisotropy=4.0)
+    model = AnitescuLcs(make_tip_and_object(spec)[0], [pair])
+    mu = np.full(model.n_lam, BOX_MU)
+    for v_tip, slides in (([0.0, 0.3, 0.0], True), ([0.0, 0.02, 0.3], False)):
+        x = model.x_default.copy()
+        x[P_BALL], x[P_TIP], x[V_TIP] = [0.0, 0.0, 0.02], [-0.5, 0.0, 0.02], v_tip
+        sample = Sample(x, np.zeros(3), x, *model.between(x, x))
+        acts = acting(model.build(x, np.zeros(3)), sample, mu, 0.01, 4.0 + 0.0 * mu)
+        assert acts.slides.all() == slides
+        if slides:
+            J = model.build(x, np.zeros(3)).J[:, :3]  # Of the tip.
+            normal, push = (np.sqrt(2.0) * J.T @ a for a in (acts.rows, acts.ways))
+            np.testing.assert_allclose(push[2] - normal[2], [-1.6, 1.6], atol=1e-9)
+            shrunk = 1.0 - 0.5 * (0.01 / 0.3) ** 2
+            np.testing.assert_allclose(push[1], -BOX_MU * shrunk, atol=1e-9)
+
+
+def test_a_force_at_a_distance_tells_of_no_mass():
+    """A tip that jerks up 10 to 20 mm above a ball that rolls, for a reason that the
+    model lacks. (A ball of 70 g was learned as one of 1.2 kg in a run of ball_rolling.)
+    """
+    model, Q_d = TipAndBall(), np.zeros(N_X)
+    reach = model.tip_radius + model.ball_radius
+    Q_d[V_TIP], Q_d[V_BALL] = 1e5, 2e4
+    pairs = [
+        ContactPair("tip::tip", "ball::ball", 1.0),
+        ContactPair("ball::ball", "table::table", 1.0),
+    ]
+    items = [Parameter("mass", 0.5, "ball")]
+    learner = ParameterLearner(
+        make_tip_and_ball(model)[0],
+        ParameterLearnerConfig(pairs, items, Q_d.tolist()),
+        0.05,
+    )
+    belief = prior(1)
+    for _ in range(20):
+        ends = np.tile(learner.model.x_default, (2, 1))
+        ends[:, P_BALL] = [0.0, 0.0, model.ball_radius]
+        ends[:, P_TIP] = [0.0, 0.0, ends[0, P_BALL][2] + reach + 0.01]
+        ends[:, V_BALL], ends[:, W_BALL] = (
+            [0.05, 0, 0],
+            [0, 0.05 / model.ball_radius, 0],
+        )
+        ends[1, P_BALL] += 0.05 * ends[0, V_BALL]
+        ends[:, V_TIP] = [[0.0, 0.0, 0.16], [0.0, 0.0, 0.20]]
+        ends[1, P_TIP] += 0.05 * ends[:, V_TIP].mean(axis=0)
+        between = learner.model.between(*ends)
+        sample = Sample(ends[0], np.zeros(3), ends[1], *between)
+        belief, _ = learner._learned(belief, sample)
+    np.testing.assert_array_equal([belief.mean[0], belief.information[0, 0]], [0, 1])
 
 
 # The system, beside worlds that are not the model's.
@@ -475,7 +651,7 @@ def test_noise_of_velocities_is_no_friction(seed):
 
 def test_what_sticks_tells_of_friction_only_beyond_the_noise():
     """A velocity of weight 1, without contact, is the parameter, but for 1 or 3."""
-    lcs, loss = sliding(1.0), Loss(np.diag([0.0, 1.0]), 1.0, 1e-4, np.inf)
+    lcs, loss = sliding(1.0), Loss(np.diag([0.0, 1.0]), 1.0, 1e-4)
     dx, dw = np.array([[0.0], [1.0]]), np.zeros((1, 1))
     for off, counts in ((1.0, False), (3.0, True)):
         sample = Sample(np.zeros(2), np.zeros(1), np.array([0.0, off]), np.zeros(1),
@@ -521,11 +697,11 @@ def test_what_is_not_felt_tells_only_that_the_gap_is_larger():
 
 @pytest.mark.parametrize("degrees", [0.0, 22.0, 45.0])
 def test_friction_is_the_same_whichever_way_a_box_slides(degrees):
-    """A planner's cone of four edges holds 29 % less between them; the learner's has
-    eight, and 8 % at most."""
+    """A planner's cone of four edges holds 29 % less between them. (The prior pulls by
+    2 %.)"""
     spec, mu, dt = PushedObject("box"), 0.5, 0.02
     diagram, plant, _ = make_tip_and_object(spec)
-    pairs = contact_pairs(spec, mu)[1:]
+    pairs = contact_pairs(spec, 2.0 * mu)[1:]  # What it does not learn is wrong.
     item = Parameter("friction", 0.5, pairs=[0, 1, 2])
     learner = ParameterLearner(diagram, ParameterLearnerConfig(pairs, [item]), dt)
     memory = learner._memory_of(learner.CreateDefaultContext())
@@ -537,7 +713,7 @@ def test_friction_is_the_same_whichever_way_a_box_slides(degrees):
         memory = learner._after(memory, x, np.zeros(3), True)
     assert memory.status == ParameterStatus.LEARNED
     learned = learner._scale.values(memory.belief.mean)[0]
-    assert learned == pytest.approx(mu, rel=0.09)
+    assert learned == pytest.approx(mu, rel=0.03)
 
 
 def test_no_plan_is_made_for_a_friction_that_drives():

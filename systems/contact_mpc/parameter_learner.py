@@ -14,12 +14,13 @@ from makebreak.systems.contact_mpc.multibody.model_parameters import (
     POSITIVE,
     Parameter,
 )
-from makebreak.systems.contact_mpc.numerics.lcs import opening_speed
 from makebreak.systems.contact_mpc.numerics.parameter_posterior import (
+    BEYOND_NOISE,
     Belief,
     Loss,
     Sample,
     Scale,
+    acting,
     certain_part,
     changes_by,
     drifted,
@@ -70,7 +71,7 @@ class ParameterLearnerConfig:
     error_share: float = 0.1
     impact_share: float = 0.5  # The same of impacts, of which no law is exact.
     trust: float = 0.5  # Factor on the loss of a step: errors of steps are correlated.
-    # Noise of the measured sliding speed [m/s]: a slower one is taken for none.
+    # Noise of the measured sliding speed [m/s]; within twice of it a contact may stick.
     slip_noise: float = 0.02
     closest: int | None = None  # As of AnitescuLcs.
 
@@ -158,12 +159,14 @@ class ParameterLearner(LeafSystem):
         gamma = min(m.eps_c, 0.5 * gamma_bound(m.at_default().F))
         self._Q_d = Q_d
         # The loss has |gap speed|^2 / (2 eps gamma) of a closed contact.
-        self._loss = Loss(np.diag(Q_d), c.contact_std**2 / gamma, gamma, c.slip_noise)
+        self._loss = Loss(np.diag(Q_d), c.contact_std**2 / gamma, gamma)
         self._scale = Scale(
             m.parameters.nominal,
             np.array([p.std for p in c.parameters]),
             m.parameters.is_log,
         )
+        self._friction = np.array([pair.friction for pair in c.contacts])
+        self._high = np.array([pair.anisotropy for pair in c.contacts])
         self._drift = np.array([p.drift for p in c.parameters]) ** 2 * period_sec
         self._config, n = c, len(c.parameters)
         self._x = self.DeclareVectorInputPort("x", m.n_x)
@@ -263,18 +266,16 @@ class ParameterLearner(LeafSystem):
             for i in np.flatnonzero(~model.parameters.is_dynamic):
                 other = values.copy()
                 other[i] += DIFFERENCE
-                both = changes_by(lcs, build_of(other), sample, loss, lam)
+                both = changes_by(lcs, build_of(other), sample, lam)
                 dx[:, i], dw[:, i] = both[0] / DIFFERENCE, both[1] / DIFFERENCE
-            slips = opening_speed(lcs, sample.x_next, loss.slip_noise) > 0.0
-            one_sided = model.sticks(lcs, slips)
+            one_sided = model.sticks(lcs, slides)
             slopes = scale.slopes(values)
             return dx * slopes, dw * slopes, one_sided
 
         try:
-            W = self._weights(belief, sample, build)
+            loss, slides = self._loss_of(belief, sample, build)
         except (ValueError, RuntimeError):  # No LCS about these states.
             return belief, None
-        loss = replace(self._loss, W=W)
         starts = []
         for i, p in enumerate(c.parameters):
             if p.kind == "gap":
@@ -283,20 +284,30 @@ class ParameterLearner(LeafSystem):
                     start[i] = at
                     starts.append(start)
         belief = drifted(belief, self._drift)
-        return updated(belief, sample, loss, c.trust, build, changes, starts)
+        after, found = updated(belief, sample, loss, c.trust, build, changes, starts)
+        # What no value explains within the noise is something that the model lacks.
+        n = np.count_nonzero(self._Q_d)
+        if found is not None and 2.0 * found.loss > n + BEYOND_NOISE * np.sqrt(2.0 * n):
+            return belief, found
+        return after, found
 
-    def _weights(self, belief: Belief, sample: Sample, build) -> np.ndarray:
-        """(n_x, n_x) of the step's errors, by what the forces under the belief do."""
+    def _loss_of(self, belief: Belief, sample: Sample, build) -> tuple[Loss, Any]:
+        """The step's loss, by what slides and what the forces under the belief do; and
+        which of the LCS's rows slide, (n_lam,) bool."""
         c, model = self._config, self.model
         lcs = build(belief.mean)
-        lacks = step_of(lcs, sample, self._loss)[0]
         values = self._scale.values(belief.mean)
+        friction = model.parameters.of_pairs("friction", values, self._friction)
+        friction, high = (model.of_rows(lcs, of) for of in (friction, self._high))
+        acts = acting(lcs, sample, friction, c.slip_noise, high)
+        loss = replace(self._loss, acting=acts)
+        lacks = step_of(lcs, sample)[0]
         further = model.parameters.unknown_at_rest(
             values, self._scale.slopes(values) * belief.std,
             sample.x_now[-model.n_v :], sample.x_next[-model.n_v :],
             sample.M, model.dt_sec,
         )  # fmt: skip
-        found = explain(lcs, sample, self._loss)
+        found = explain(lcs, sample, loss)
         if found is not None and found.lam.any():
             # Forces may act at the step's end instead of its beginning.
             before, after = (
@@ -306,9 +317,13 @@ class ParameterLearner(LeafSystem):
             impulse = model.dt_sec * (after - before).T @ found.lam
             turned = np.linalg.solve(sample.M, impulse)
             further += np.outer(turned, turned) / 12.0
+            for errors in acts.errors:
+                astray = (lcs.D @ (errors * found.f))[-model.n_v :]
+                further += astray @ astray.T
         impacts = c.impact_share**2 * impact_part(lcs, sample, lacks)
         share = np.sqrt(c.error_share**2 + impacts)
-        return error_weights(self._Q_d, share, lacks, sample.M, further)
+        W = error_weights(self._Q_d, share, lacks, sample.M, further)
+        return replace(loss, W=W), acts.slides
 
 
 def _finer(pair: ContactPair) -> ContactPair:

@@ -190,13 +190,16 @@ class AnitescuLcs:
         gap = self.parameters.of_pairs("gap", parameters, np.zeros(self.n_pairs))
         return self._contacts.with_gap(lcs, gap) if gap.any() else lcs
 
+    def of_rows(self, lcs: LCS, of_pairs) -> np.ndarray:
+        """(n_lam,) of each row of an LCS, what (n_pairs,) of its pair is."""
+        return self._contacts.of_contacts(of_pairs)[np.asarray(lcs.contact, dtype=int)]
+
     def sticks(self, lcs: LCS, slips) -> np.ndarray:
         """(n,) whether a parameter is the friction of pairs of which none slips.
 
         Args: slips (n_lam,) bool, of the LCS's rows.
         """
-        pair = self._contacts.of_contacts(np.arange(self.n_pairs))
-        slipping = set(pair[np.asarray(lcs.contact, dtype=int)[slips]])
+        slipping = set(self.of_rows(lcs, np.arange(self.n_pairs))[slips])
         return np.array([
             p.kind == "friction" and not slipping & set(p.pairs)
             for p in self.parameters.items

@@ -14,7 +14,8 @@ so that what no step tells stays at the model's value, with the model's deviatio
 With rows a(z, lam) of the prediction and of the closed contacts, the forces that are
 free are eliminated: only the part of da/dz that no change of these forces explains
 tells of z (variable projection, Golub and Pereyra, SIAM J. Numerical Analysis 10
-(1973); Kaufman, BIT 15 (1975)).
+(1973); Kaufman, BIT 15 (1975)). Of a contact that certainly slides only the size of the
+force is free: it is on the boundary of the cone, against the slip (`acting`).
 
 Source: the loss, ACI-MPC section VI; the filter: Bell, Cathey, IEEE Trans. Automatic
 Control 38 (1993).
@@ -25,8 +26,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from makebreak.systems.contact_mpc.numerics.lcs import LCS, opening_speed
+from makebreak.systems.contact_mpc.numerics.contact_rows import friction_edges
+from makebreak.systems.contact_mpc.numerics.lcs import LCS
 from makebreak.systems.contact_mpc.numerics.residual_learner import (
+    gamma_bound,
     solve_step,
 )
 
@@ -103,15 +106,31 @@ class Sample:
         return x
 
 
+@dataclass(frozen=True, eq=False)
+class Acting:
+    """What the forces of a step can be: lam = ways f, with m numbers f >= 0 [N].
+
+    Of a contact that slides one way, of another one its edges. ways (n_lam, m); rows
+    (n_lam, m): rows' w is the gap velocity of each way, of its contact's normal; slides
+    (n_lam,) bool; errors (2, n_lam, m): deviations of lam over f, across the slip and
+    along it.
+    """
+
+    ways: np.ndarray
+    rows: np.ndarray
+    slides: np.ndarray
+    errors: np.ndarray
+
+
 @dataclass(frozen=True)
 class Loss:
     """W (n_x, n_x) inverse covariance of the one-step errors; eps, gamma as in
-    residual_learner.py; slip_noise of opening_speed."""
+    residual_learner.py; acting; None: no contact slides."""
 
     W: np.ndarray
     eps: float
     gamma: float
-    slip_noise: float
+    acting: Acting | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,11 +140,65 @@ class Explained:
     lcs: LCS
     loss: float
     lam: np.ndarray  # (n_lam,) [N]
-    eta: np.ndarray  # (n_lam,) [m/s]
-    force: np.ndarray  # (n_lam,) [N] eps times the loss's derivative in the gap speed
+    acting: Acting
+    f: np.ndarray  # (m,) [N]
+    eta: np.ndarray  # (m,) [m/s]
+    force: np.ndarray  # (m,) [N] eps times the loss's derivative in the gap speed
+    D: np.ndarray  # (n_x, m) and
+    F: np.ndarray  # (m, m), of f
 
 
-def step_of(lcs: LCS, sample: Sample, loss: Loss):
+def acting(lcs: LCS, sample: Sample, friction, noise: float, high=None) -> Acting:
+    """What the contacts' forces can be, by how they are seen to slide.
+
+    A contact slides for certain where the slip's mean over the step is BEYOND_NOISE.
+    Its force is then the normal's and friction times it against the slip, as Coulomb
+    has it: the exact cone, of which the edges are an approximation. In another contact
+    any force in the cone costs nothing, whatever the noise of a slip.
+
+    Args: friction (n_lam,) of the rows' contacts; noise [m/s] of the slip's speed;
+        infinite: none slides. high (n_lam,): anisotropy of ContactPair; None: ones.
+        Where it is not 1 the cone's first axis stands for forces that no slip tells:
+        any of them may act, and the contact slides if it does across that axis.
+    """
+    J, _, contact = pushes(lcs)
+    n_v, n = sample.v_mean.size, len(J)
+    along = (J - normals(lcs)) / np.where(friction > 0.0, friction, np.inf)[:, None]
+    ends = along @ np.stack([sample.x_now[-n_v:], sample.x_next[-n_v:]], axis=1)
+    parts, slides = [np.zeros((4, n, 0))], np.zeros(n, bool)
+    for one in np.unique(contact):
+        mine = contact == one
+        k, ratio = int(mine.sum()), 1.0 if high is None else high[mine][0]
+        axes = np.linalg.pinv(friction_edges(max(k // 2, 1)))[:, :k]
+        now, after = (axes @ ends[mine]).T
+        slip, change = 0.5 * (now + after), after - now
+        error, spread = noise**2, np.zeros(1)
+        if ratio != 1.0:
+            error, spread = error + (slip[0] / ratio) ** 2, np.array([-1.0, 1.0])
+            slip[0] = change[0] = 0.0
+        error += change @ change / 12.0  # A slip that turns evenly.
+        slides[mine] = slip @ slip > BEYOND_NOISE**2 * error
+        if slides[mine].any():
+            size = np.linalg.norm(slip)
+            angle = np.sqrt(error) / size  # By which the slip may be turned.
+            against, across = np.array([-slip, [-slip[1], slip[0]]]) / size @ axes
+            own = np.zeros((4, k, spread.size))
+            own[0] = (1.0 / k + (1.0 - 0.5 * angle**2) * against)[:, None]
+            own[0] += np.outer(axes[0], spread)
+            own[2:] = np.stack([across, angle / np.sqrt(2.0) * against])[..., None]
+            own[2:] *= angle
+        else:
+            own = np.zeros((4, k, k))
+            own[0] = np.eye(k)
+        own /= np.sqrt(own.shape[2])  # All ways of a contact together count once.
+        own[1] = own[0].sum(axis=0) / k
+        parts.append(np.zeros((4, n, own.shape[2])))
+        parts[-1][:, mine] = own
+    ways, rows, *errors = np.concatenate(parts, axis=2)
+    return Acting(ways, rows, slides, np.array(errors))
+
+
+def step_of(lcs: LCS, sample: Sample):
     """(n_x,), (n_lam,) what the model about the middle lacks of the measured change
     without contact forces, and the gap velocities at the end without them."""
     x, n_v = sample.x, sample.v_mean.size
@@ -133,11 +206,11 @@ def step_of(lcs: LCS, sample: Sample, loss: Loss):
     lacks = lcs.A @ x + lcs.B @ sample.u + lcs.d - x
     lacks -= sample.x_next - sample.x_now
     # A contact that pushes is closed at one end of the step at least: its row has the
-    # smaller of the gaps there, instead of one that the end's velocity extrapolates.
-    w = lcs.E @ x + lcs.H @ sample.u + lcs.c - pushes(lcs)[0] @ (sample.v_mean - v_now)
-    normal = normals(lcs)
-    w -= 0.5 * abs(normal @ sample.v_mean) + normal @ v_next
-    return lacks, w + opening_speed(lcs, sample.x_next, loss.slip_noise)
+    # smaller of the gaps there, instead of one that the end's velocity extrapolates,
+    # and the error of that velocity: Anitescu's contact would open as it slides.
+    J = pushes(lcs)[0]
+    w = lcs.E @ x + lcs.H @ sample.u + lcs.c - J @ (sample.v_mean - v_now + v_next)
+    return lacks, w - 0.5 * abs(normals(lcs) @ sample.v_mean)
 
 
 def error_weights(Q_d, share, lacks, M, further=0.0) -> np.ndarray:
@@ -197,34 +270,40 @@ def normals(lcs: LCS) -> np.ndarray:
 
 def explain(lcs: LCS, sample: Sample, loss: Loss) -> Explained | None:
     """The forces of the violation-based loss; None where its QP was not solved."""
-    z, q = step_of(lcs, sample, loss)
-    weighted = loss.eps * lcs.D.T @ loss.W
-    P, p = weighted @ lcs.D, weighted @ z
-    if not (np.isfinite(P).all() and np.isfinite(p).all() and np.isfinite(q).all()):
+    z, q = step_of(lcs, sample)
+    own = loss.acting or acting(lcs, sample, np.ones(lcs.n_lam), np.inf)
+    D, q = lcs.D @ own.ways, own.rows.T @ q
+    weighted = loss.eps * D.T @ loss.W
+    P, p = weighted @ D, weighted @ z
+    # As soft as one edge, and so soft that the QP is convex.
+    F = own.rows.T @ lcs.F @ own.ways
+    F += loss.gamma * (np.eye(len(q)) - own.rows.T @ own.ways)
+    if not all(np.isfinite(of_qp).all() for of_qp in (P, p, F, q)):
         return None
-    solved, cost, lam, eta, force = solve_step(P, p, lcs.F, q, loss.gamma)
+    F += np.eye(len(q)) * max(loss.gamma - 0.5 * gamma_bound(F + 0.5 * P), 0.0)
+    solved, cost, f, eta, force = solve_step(P, p, F, q, loss.gamma)
     total = float(0.5 * z @ loss.W @ z + cost / loss.eps)
     if not (solved and np.isfinite(total)):
         return None
-    return Explained(lcs, total, lam, eta, force)
+    return Explained(lcs, total, own.ways @ f, own, f, eta, force, D, F)
 
 
-def changes_by(lcs: LCS, other: LCS, sample: Sample, loss: Loss, lam):
+def changes_by(lcs: LCS, other: LCS, sample: Sample, lam):
     """(n_x,), (n_lam,) how x_next and the gap velocities differ in another LCS, at the
     forces lam."""
-    (z, q), (z_other, q_other) = (step_of(of, sample, loss) for of in (lcs, other))
+    (z, q), (z_other, q_other) = (step_of(of, sample) for of in (lcs, other))
     dD, dF = other.D - lcs.D, other.F - lcs.F
     return z_other - z + dD @ lam, q_other - q + dF @ lam
 
 
 def felt(found: Explained, root) -> np.ndarray:
-    """(n_lam,) bool: rows of the contacts whose force is BEYOND_NOISE, as root (n_x,
-    n_x) weighs it. Of another nobody can say that it is closed: a gap that is larger
-    than what is left of the force needs explains the step as well."""
+    """(m,) bool: of the contacts whose force is BEYOND_NOISE, as root (n_x, n_x) weighs
+    it. Of another nobody can say that it is closed: a gap that is larger than what is
+    left of the force needs explains the step as well."""
     contact = pushes(found.lcs)[2]
     each = contact == np.unique(contact)[:, None]
     size = np.linalg.norm((each * found.lam) @ (root @ found.lcs.D).T, axis=1)
-    return (each & (size > BEYOND_NOISE)[:, None]).any(axis=0)
+    return ((size > BEYOND_NOISE) @ each @ (found.acting.ways != 0.0)).astype(bool)
 
 
 def gradient_and_information(
@@ -238,17 +317,21 @@ def gradient_and_information(
         goes one way would count, and what goes the other way not, so such a step counts
         for nothing unless it is BEYOND_NOISE.
     """
-    lcs = found.lcs
-    error = loss.W @ (step_of(lcs, sample, loss)[0] + lcs.D @ found.lam)
-    gradient = dx.T @ error + dw.T @ found.force / loss.eps
+    error = step_of(found.lcs, sample)[0] + found.lcs.D @ found.lam
+    dw = found.acting.rows.T @ dw
+    gradient = dx.T @ loss.W @ error + dw.T @ found.force / loss.eps
     root, stiff = root_of(loss.W), 1.0 / np.sqrt(loss.eps * loss.gamma)
-    closed, free = (found.eta == 0.0) & felt(found, root), found.lam > 0.0
+    closed, free = (found.eta == 0.0) & felt(found, root), found.f > 0.0
     of_z = np.vstack([root @ dx, stiff * dw[closed]])
-    of_lam = np.vstack([root @ lcs.D[:, free], stiff * lcs.F[np.ix_(closed, free)]])
+    of_lam = np.vstack([root @ found.D[:, free], stiff * found.F[np.ix_(closed, free)]])
     if free.any():
         basis, _ = np.linalg.qr(of_lam)
         of_z = of_z - basis @ (basis.T @ of_z)
-    noise = one_sided & (gradient**2 < BEYOND_NOISE**2 * (of_z**2).sum(axis=0))
+    left = of_z.T @ np.append(root @ error, stiff * loss.gamma * found.force[closed])
+    noise = one_sided & (left**2 <= BEYOND_NOISE**2 * (of_z**2).sum(axis=0))
+    # A force at a distance stands for what the model lacks, and tells of gaps alone.
+    far = BEYOND_NOISE * np.sqrt(loss.eps * loss.gamma) * found.acting.rows.sum(axis=0)
+    noise = noise | (dx.any(axis=0) & (found.eta > far)[found.f > 0.0].any())
     gradient, of_z = np.where(noise, 0.0, gradient), np.where(noise, 0.0, of_z)
     return gradient, of_z.T @ of_z
 
