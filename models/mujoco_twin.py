@@ -221,7 +221,8 @@ class MujocoTwin:
                     one, other = sorted(pair)
                     pairs[one, other] = e.parameters["friction"]
         for (one, other), friction in pairs.items():
-            _add_pair(spec, m, writer, one, other, friction)
+            if _collide(m, one, other):
+                _add_pair(spec, m, writer, one, other, friction)
 
     def _set_drives(self, spec, loaded: LoadedScene, effects: Sequence[Effect]):
         act, plant = loaded.scene.actuation, loaded.plant
@@ -299,6 +300,24 @@ def _size(shape: Shape) -> np.ndarray:
     if isinstance(shape, (Convex, Mesh)):
         return np.array(shape.scale3())
     return np.zeros(0)
+
+
+def _collide(m, one: int, other: int) -> bool:
+    """Whether MuJoCo looks for contacts of two geoms: it does for what is written as
+    a pair, but else not of a link with the one that carries it, nor of what is
+    excluded or of another type."""
+    if not (m.geom_contype[one] & m.geom_conaffinity[other]
+            or m.geom_contype[other] & m.geom_conaffinity[one]):  # fmt: skip
+        return False
+    bodies = m.geom_bodyid[[one, other]]
+    if sum(int(b) << k for b, k in zip(sorted(bodies), (16, 0), strict=True)) in (
+        m.exclude_signature
+    ):
+        return False
+    a, b = welds = m.body_weldid[bodies]
+    carriers = m.body_weldid[m.body_parentid[welds]]
+    carried = 0 not in (a, b) and (carriers[0] == b or carriers[1] == a)
+    return a != b and not carried
 
 
 def _add_pair(spec, m, writer, one: int, other: int, friction: float) -> None:
