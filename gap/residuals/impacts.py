@@ -458,10 +458,10 @@ class ImpactProblem(ImpactWindows, WindowedProblem):
         """(m, k) what each kind with one parameter does at each joint, in its first
         step; but those that make commands late."""
         columns = []
-        for kind, places, name, trials in kinds_of_joints(self):
+        for kind, at, name, trials in kinds_of_joints(self):
             moved = None
             if KINDS[kind].path not in ("delay", "lag"):
-                moved = tried(self, Effect(kind, list(places), {name: trials[0][1]}))
+                moved = tried(self, Effect(kind, [at], {name: trials[0][1]}))
             if moved is not None and np.abs(self.base() - moved).max() > 1e-3:
                 columns.append(self.base() - moved)
         return np.stack(columns, 1) if columns else np.zeros((len(self.base()), 0))
@@ -556,7 +556,7 @@ class ImpactProblem(ImpactWindows, WindowedProblem):
                     continue
                 trials = [((f - 1.0) * now, f * now) for f in TRIED]
                 if now > 0.0:
-                    yield kind, (at,), name, trials
+                    yield kind, at, name, trials
             try:
                 stiffness = self.dynamics.now(STIFFNESS, [at])["stiffness"]
             except ValueError:
@@ -564,16 +564,16 @@ class ImpactProblem(ImpactWindows, WindowedProblem):
             # A mass m on a spring k touches for pi sqrt(m/k).
             critical = 2.0 * stiffness * float(np.median(self._touch_sec)) / np.pi
             values = [share * critical for share in DAMPED]
-            yield DAMPER, (at,), "damping", [(c, c) for c in values]
+            yield DAMPER, at, "damping", [(c, c) for c in values]
 
     def _of_places(self):
         for at, axis in self._met_axes():
             if at in self.dynamics.places(PLACE):
-                yield PLACE, (at,), axis, [(x, x) for x in PLACES]
+                yield PLACE, at, axis, [(x, x) for x in PLACES]
 
 
 def kinds_of_joints(model: WindowModel):
-    """(kind, places, parameter, trials) of kinds with one parameter, at each joint; a
+    """(kind, place, parameter, trials) of kinds with one parameter, at each joint; a
     trial is a step and the value with it."""
     dynamics, plant = model.dynamics, model.dynamics.plant
     M = np.diag(plant.CalcMassMatrix(plant.CreateDefaultContext()))
@@ -607,7 +607,7 @@ def kinds_of_joints(model: WindowModel):
                 "": 0.05,
             }.get(p.unit)
             if step and abs(now) < 1e20:
-                yield kind, (at,), p.name, [(step, now + step)]
+                yield kind, at, p.name, [(step, now + step)]
 
 
 def candidates_of(
@@ -615,24 +615,22 @@ def candidates_of(
 ) -> list[Candidate]:
     """Candidates of one parameter, by simulating them beside what is there now.
 
-    Args: trials: (kind, places, parameter, [(step, value with it), ...]) of each.
+    Args: trials: (kind, place, parameter, [(step, value with it), ...]) of each.
     """
     found = []
     taken = {(e.kind, at) for e in current.effects for at in e.at}
-    for kind, places, name, steps in trials:
+    for kind, at, name, steps in trials:
         columns, readers = [], []
-        is_new = not any((kind, at) in taken for at in places)
-        for step, value in steps if is_new else ():
-            effect = Effect(kind, list(places), {name: value})
-            moved = tried(model, *current.effects, effect)
+        for step, value in steps if (kind, at) not in taken else ():
+            moved = tried(model, *current.effects, Effect(kind, [at], {name: value}))
             if moved is None or not np.abs(current.r - moved).max() > 1e-3:
                 continue
             columns.append(((current.r - moved) / step)[:, None])
             readers.append(reader_of_trial(kind, (name,), [(step, {name: value})]))
         if columns:
-            least = model.least(kind, places)
+            least = model.least(kind, [at])
             found.append(
-                Candidate(kind, places, 1, tuple(columns), tuple(readers), least=least)
+                Candidate(kind, (at,), 1, tuple(columns), tuple(readers), least=least)
             )
     return found
 

@@ -23,9 +23,8 @@ from makebreak.gap.simulation.mujoco_simulation import MujocoSimulation
 from makebreak.gap.simulation.windows import LARGEST, Window, WindowModel, seen_in
 from makebreak.gap.thresholds import UNEXPLAINED_RMS
 from makebreak.models.effects import KINDS
-from makebreak.models.effects.contact import FRICTION
 from makebreak.models.effects.ground import PLACE
-from makebreak.models.effects.kind import Effect, find_body, full_name, one_dof_joints
+from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
 from makebreak.models.scene import Scene
 
 WINDOW_SEC, MOST = 0.6, 60
@@ -36,7 +35,6 @@ CHANCE = 1.33
 LATE, LESS = (-1.25, -1.0, -0.75, -0.5, -0.25, 0.0), 0.97
 # In which a calm start is looked for, if so much of a window is left.
 CALM_SEC, LEAST = 0.3, 0.65
-OTHER_FRICTION = (0.5, 0.9, 1.7)  # Of the ground's, tried.
 PART_SEC = 0.1  # Of a window, where parts are held out.
 # Of how far a parameter is from the scene: where the sum of squares is asked.
 ASIDE = (-0.4, -0.2, -0.1, -0.05, 0.0, 0.05, 0.1, 0.2, 0.4)
@@ -259,28 +257,11 @@ class MujocoProblem(WindowModel, WindowedProblem):
 
     def candidates(self, nuisances: Nuisances, current: Fitted) -> list[Candidate]:
         found = super().candidates(nuisances, current)
-        trials = [*kinds_of_joints(self), *self._trodden()]
-        found += candidates_of(self, trials, current)
+        found += candidates_of(self, kinds_of_joints(self), current)
         return found + loads(
             self.dynamics, {(e.kind, at) for e in current.effects for at in e.at},
             current.r, partial(tried, self, *current.effects), self._carriers,
         )  # fmt: skip
-
-    def _trodden(self):
-        """Trials of the friction of each ground with all links, which is one: pairs
-        that have a free body are asked for one by one."""
-        plant = self.dynamics.plant
-        shaped = [
-            at for at in self._carriers(FRICTION) if at not in self.bodies
-            and plant.GetCollisionGeometriesForBody(
-                find_body(Effect("", [at], {}), plant, at)
-            )
-        ]  # fmt: skip
-        for ground in self.dynamics.places(PLACE) if shaped else ():
-            pairs = tuple(f"{at}~{ground}" for at in shaped)
-            now = self.dynamics.now(FRICTION, pairs[-1:])["friction"]
-            tries = [((by - 1.0) * now, by * now) for by in OTHER_FRICTION]
-            yield FRICTION, pairs, "friction", tries
 
     def _carriers(self, kind: str) -> list[str]:
         """Bodies that joints join; less those that are free where the kind is of what
