@@ -9,6 +9,7 @@ from makebreak.gap.does_not_fit import DoesNotFit  # noqa: E402
 from makebreak.gap.simulation.commands import Commands  # noqa: E402
 from makebreak.gap.simulation.mujoco_simulation import MujocoSimulation  # noqa: E402
 from makebreak.models.effects.kind import Effect  # noqa: E402
+from makebreak.models.mujoco_twin import MujocoTwin  # noqa: E402
 from makebreak.models.scene import InitialSection, read_scene  # noqa: E402
 
 FILE = """
@@ -122,3 +123,26 @@ def test_what_mujoco_has_no_place_for_is_refused(tmp_path):
     )
     with pytest.raises(DoesNotFit, match="one MJCF file"):
         MujocoSimulation(read_scene(tmp_path / "other.yaml"))
+
+
+@pytest.mark.parametrize("more", ["", '<exclude body1="trunk" body2="hat"/>'])
+def test_a_pair_is_only_of_what_mujoco_lets_touch(tmp_path, more):
+    """It does not of a link with the one that carries it, nor of what is excluded."""
+    (tmp_path / "w.xml").write_text(
+        '<mujoco model="w"><worldbody><geom name="floor" type="plane" size="3 3 .1"/>'
+        '<body name="trunk" pos="0 0 .2"><freejoint/><geom size=".1"/><body name="leg">'
+        '<joint name="j"/><geom size=".12"/></body></body><body name="hat" '
+        'pos="0 0 .4"><freejoint/><geom size=".1"/></body></worldbody>'
+        f"<contact>{more}</contact></mujoco>"
+    )
+    pairs = ["w.trunk~w.leg", "w.trunk~w.hat", "w.trunk~w.floor"]
+    effects = "".join(
+        f"- {{kind: contact_friction, at: {at}, parameters: {{friction: 0.5}}}}\n"
+        for at in pairs
+    )
+    (tmp_path / "scene.yaml").write_text(
+        f"directives:\n- add_model: {{name: w, file: w.xml}}\neffects:\n{effects}"
+    )
+    scene = read_scene(tmp_path / "scene.yaml")
+    made = MujocoTwin(scene).with_effects(scene.effects).model
+    assert made.npair == (1 if more else 2)
