@@ -20,7 +20,13 @@ from makebreak.gap.residuals.impacts import candidates_of, kinds_of_joints, trie
 from makebreak.gap.residuals.mechanism_candidates import loads
 from makebreak.gap.residuals.objects import MOST_EFFECTS, WindowedProblem
 from makebreak.gap.simulation.mujoco_simulation import MujocoSimulation
-from makebreak.gap.simulation.windows import LARGEST, Window, WindowModel, seen_in
+from makebreak.gap.simulation.windows import (
+    BESIDE,
+    LARGEST,
+    Window,
+    WindowModel,
+    seen_in,
+)
 from makebreak.gap.thresholds import UNEXPLAINED_RMS
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.ground import PLACE
@@ -68,7 +74,7 @@ class MujocoProblem(WindowModel, WindowedProblem):
         )  # fmt: skip
         if any(map(self._by_measured, self.recordings)):
             raise DoesNotFit("measured efforts drive the joints: these drift")
-        self.windows = list(self.windows)
+        self.windows = [self._as_smoothed(w) for w in self.windows]
         self._weighed_by: tuple = ()
         self._in_parts = False
         if commands_late is not None:
@@ -87,6 +93,29 @@ class MujocoProblem(WindowModel, WindowedProblem):
         for x in states.values():
             pace += x[rows, 2] ** 2 / max(float(np.mean(x[:, 2] ** 2)), 1e-12)
         return int(rows[np.argmin(pace)]) if len(rows) else row
+
+    def _as_smoothed(self, w: Window) -> Window:
+        """The window, less sure of its start where the smoothed motion is farther from
+        what was measured there than noise is: something touches or parts."""
+        recording = self.recordings[w.recording]
+        episode = next(
+            e for e in recording.episodes if e.first <= w.rows.start < e.last
+        )
+        path = self._paths[w.recording, episode.first]
+        k = w.rows.start - episode.first
+        near = slice(max(k - BESIDE, 0), k + BESIDE + 1)
+        wide = {}
+        for name, P in w.spread.items():
+            at, what = name.rsplit(".", 1)
+            off = [1.0]
+            rate = f"{at}.velocity" if what == "position" else f"{at}.v{what}"
+            for order, channel in enumerate((name, rate)):
+                if channel in recording.channels:
+                    y = recording[channel][episode.rows][near] - path[name][near, order]
+                    y = y[np.isfinite(y)] / recording.channels[channel].noise
+                    off.append(float(np.mean(y**2)) if len(y) else 1.0)
+            wide[name] = max(off) * P
+        return replace(w, spread=wide)
 
     def _set_late(self, effects: Sequence[Effect]) -> None:
         """A loop that writes its row after a step writes what acted since the step, and
