@@ -284,7 +284,7 @@ def _compared(
     say("preparing motions and windows")
     if not is_mechanism:
         ask = partial(_in_mujoco, scene, decided, reported, [*checks, *done], jobs, say)
-        with budget.share(2).running() as own:
+        with budget.share(1.5).running() as own:
             by_mujoco = own.if_time("simulating windows with MuJoCo", ask, None)
         seconds["MuJoCo"] = clock.lap()
         if by_mujoco is not None:

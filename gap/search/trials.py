@@ -2,7 +2,9 @@
 
 from collections.abc import Sequence
 
-from makebreak.gap.fit import derivative_free_search, fit_effects
+import numpy as np
+
+from makebreak.gap.fit import MOST_FREE, derivative_free_search, fit_effects
 from makebreak.gap.numerics.selection import Screen, simplest
 from makebreak.gap.problem import Candidate
 from makebreak.gap.search.choice import (
@@ -90,13 +92,19 @@ def fit_each(
     search: Comparison, screen: Screen, chosen: Sequence[Choice],
     short: Sequence[Ranked], known: Sequence[Trial] = (),
 ) -> list[Trial]:  # fmt: skip
-    """Each candidate beside what is chosen, all fitted exactly; those that are
-    possible.
+    """Each candidate beside what is chosen, all fitted exactly, those with the fewest
+    parameters first; those that are possible. Where simulations are all that there is,
+    not those of many once one of few leaves what noise does.
 
     Args: known: fits of the same candidates, from where to go on.
     """
-    trials = []
-    for k, each in enumerate(short):
+    found: dict[int, Trial] = {}
+    for k in sorted(range(len(short)), key=lambda k: short[k].candidate.size):
+        each = short[k]
+        least = min((t.fit.score for t in found.values()), default=np.inf)
+        many = search.plan.jumps and each.candidate.size > MOST_FREE
+        if many and least <= NOISE_RMS_MAX:
+            continue
         start = [*[c.effect for c in chosen], *each.effects]
         if known:
             start = list(known[k].fit.effects)
@@ -107,7 +115,8 @@ def fit_each(
             continue
         search.say(f"  {each.candidate.name}: {fit.score:.3g}")
         if is_possible(fit, each, len(chosen)):
-            trials.append(Trial(fit, each))
+            found[k] = Trial(fit, each)
+    trials = [found[k] for k in sorted(found)]
     if not known and search.plan.jumps:
         _search_finalists(search, screen, chosen, trials)
     return trials
