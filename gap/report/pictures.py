@@ -56,7 +56,7 @@ def picture_of_channels(result: GapResult) -> Figure:
     axes.set_yticks(rows, names, fontsize=9)
     axes.invert_yaxis()
     left = len(per_channel) - len(names)
-    more = f" (the largest; {left} more are in result.json)" if left > 0 else ""
+    more = f"\n(the largest; {left} more are in result.json)" if left > 0 else ""
     axes.set_xlabel(f"held-out error / expected error{more}", fontsize=9)
     axes.legend(
         fontsize=8, frameon=False, ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0)
