@@ -489,6 +489,16 @@ def test_the_interval_of_what_slides_holds_as_often_as_it_says():
     assert 0.85 <= np.mean(inside) <= 0.95
 
 
+@pytest.mark.parametrize(("after", "counts"), [(0.35, True), (0.8, False)])
+def test_a_step_that_no_value_explains_does_not_count(after, counts):
+    """A box that slides on its own gets slower; no friction makes it faster."""
+    learner, sample = sliding_box([0.5, 0.0, 0.0], [after, 0.0, 0.0])
+    belief, found = learner._learned(prior(1), sample)
+    assert found is not None
+    assert (belief.information[0, 0] > 1.0) == counts
+    assert (belief.mean[0] != 0.0) == counts
+
+
 def test_noise_at_rest_tells_nothing():
     """The value went down by 1 % a step, as what a slip's noise costs is less with a
     smaller mass."""
