@@ -11,6 +11,7 @@ from makebreak.gap.data.coordinates import by_lists
 from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.data.robot import Log, propose_scene, read_robot
 from makebreak.gap.data.table import RecordingTable
+from makebreak.gap.residuals import in_mujoco
 from makebreak.gap.residuals.contact_problem import ContactProblem
 from makebreak.gap.thresholds import AGREEMENT_RMS_MAX
 from makebreak.gap.workflow import run_gap
@@ -289,6 +290,23 @@ def test_friction_of_a_pair_is_mujocos(tmp_path):
     for pair, friction in (("w.floor", 1.0), ("w.pusher", 0.4)):
         now = dynamics.now("contact_friction", [f"w.crate~{pair}"])
         assert now["friction"] == pytest.approx(friction)
+
+
+def test_starts_at_random_have_the_covariance_of_all_axes(tmp_path, monkeypatch):
+    """With fewer simulations: two for each of them, or for each axis."""
+    scene, recordings = pushed(tmp_path, 0.9, "elliptic")
+    made = []
+    for most in (100, 12):
+        monkeypatch.setattr(in_mujoco, "MOST_MOVES", most)
+        made.append(in_mujoco.MujocoProblem(scene, recordings, 0.0))
+    every, some = made
+    axes = 2 * len(every.windows[0].state)
+    assert axes > 12 and every.runs - some.runs == 2 * (axes - 12)
+    wide = [
+        np.concatenate([(w.std / p.noise) ** 2 - 1.0 for w in p.windows]) for p in made
+    ]
+    start = np.median(wide[1][wide[0] > 1.0] / wide[0][wide[0] > 1.0])
+    assert 0.6 < start < 1.6
 
 
 @pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])

@@ -25,6 +25,7 @@ from makebreak.gap.simulation.windows import (
     LARGEST,
     Window,
     WindowModel,
+    moved,
     seen_in,
 )
 from makebreak.gap.thresholds import UNEXPLAINED_RMS
@@ -190,7 +191,7 @@ class MujocoProblem(WindowModel, WindowedProblem):
         goes together throughout the window."""
         kept, self._base = self.windows, None
         plain = self.simulate(effects)
-        moved, bent = [], [np.zeros_like(y) for y in plain]
+        apart, bent = [], [np.zeros_like(y) for y in plain]
         axes = 2 * len(kept[0].state)
         moves = np.eye(axes)
         if axes > MOST_MOVES:  # So many at random have the same covariance.
@@ -200,14 +201,14 @@ class MujocoProblem(WindowModel, WindowedProblem):
             for by in moves:
                 pair = []
                 for sign in (1.0, -1.0):
-                    self.windows = [_moved(w, sign * by) for w in kept]
+                    self.windows = [moved(w, sign * by) for w in kept]
                     pair.append(self.simulate(effects))
                 # What is straight in it, and what is bent.
-                moved.append([0.5 * (a - b) for a, b in zip(*pair, strict=True)])
-                moved.append(
+                apart.append([0.5 * (a - b) for a, b in zip(*pair, strict=True)])
+                apart.append(
                     [0.5 * (a + b) - y for a, b, y in zip(*pair, plain, strict=True)]
                 )
-                for total, y in zip(bent, moved[-1], strict=True):
+                for total, y in zip(bent, apart[-1], strict=True):
                     total += np.nan_to_num(y**2)
         finally:
             self.windows = kept
@@ -217,10 +218,10 @@ class MujocoProblem(WindowModel, WindowedProblem):
         for k, w in enumerate(kept):
             mine = np.sqrt(own**2 + CHANCE * bent[k] / len(moves))
             self._own.append(mine)
-            by = np.stack([y[k] / mine for y in moved], axis=-1)
+            by = np.stack([y[k] / mine for y in apart], axis=-1)
             by = np.nan_to_num(by, posinf=0.0, neginf=0.0)
             by[~np.isfinite(seen_in(self, w))] = 0.0
-            A, size, _ = np.linalg.svd(by.reshape(-1, len(moved)), full_matrices=False)
+            A, size, _ = np.linalg.svd(by.reshape(-1, len(apart)), full_matrices=False)
             self._start.append((A, 1.0 - 1.0 / np.sqrt(1.0 + size**2)))
             wide = mine * np.sqrt(1.0 + np.sum(by**2, axis=-1))
             self.windows[k] = replace(w, std=wide)
@@ -304,18 +305,6 @@ class MujocoProblem(WindowModel, WindowedProblem):
         asked = [[p.name for p in e.parameters] for e in KINDS.values() if e.absolute]
         own = self.bodies if names in asked else ()
         return [at for at in self.dynamics.links() if at in joined and at not in own]
-
-
-def _moved(w: Window, by: np.ndarray) -> Window:
-    """The window from another start: by (2 k,), in deviations, along the axes of the
-    uncertainty of each of k signals' value and rate."""
-    state = dict(w.state)
-    for d, (name, x) in zip(by.reshape(-1, 2), w.state.items(), strict=True):
-        if d.any():
-            values, u = np.linalg.eigh(w.spread[name])
-            state[name] = x = np.array(x)
-            x[:2] += u @ (d * np.sqrt(np.maximum(values, 0.0)))
-    return replace(w, state=state)
 
 
 def contacts_of_mujoco(problem: MujocoProblem) -> Finding:

@@ -146,14 +146,21 @@ def _most_seen(seen: np.ndarray, every: int) -> int:
     return max(offsets, key=lambda at: float(np.mean(seen[at::every])))
 
 
+def moved(w: Window, by: np.ndarray) -> Window:
+    """The window from another start: by (2 k,), in deviations, along the axes of the
+    uncertainty of each of k signals' value and rate."""
+    state = dict(w.state)
+    for d, (name, x) in zip(by.reshape(-1, 2), w.state.items(), strict=True):
+        if d.any():
+            values, u = np.linalg.eigh(w.spread[name])
+            state[name] = x = np.array(x)
+            x[:2] += u @ (d * np.sqrt(np.maximum(values, 0.0)))
+    return replace(w, state=state)
+
+
 def drawn(w: Window, rng) -> Window:
     """The window from another start that its measurements allow."""
-    state = {}
-    for name, x in w.state.items():
-        values, u = np.linalg.eigh(w.spread[name])
-        state[name] = np.array(x)
-        state[name][:2] += u @ (np.sqrt(np.maximum(values, 0.0)) * rng.normal(size=2))
-    return replace(w, state=state)
+    return moved(w, rng.normal(size=2 * len(w.state)))
 
 
 def n_rows(window) -> int:
