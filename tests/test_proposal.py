@@ -776,6 +776,18 @@ def test_efforts_tell_gains_beside_late_commands_and_another_zero(known, late):
     np.testing.assert_allclose([g.kd for g in found], 2.0, rtol=1e-2)
 
 
+def test_without_efforts_no_joint_has_gains_by_them():
+    """None of each joint, also where one of two logs has none."""
+    t = 0.01 * np.arange(400)
+    q = np.stack([np.sin(t), np.cos(t)], axis=1)
+    whole, none = (
+        ServoLog(t, q, q + 0.1, 40.0 * np.full_like(q, 0.1)),
+        ServoLog(t, q, q),
+    )
+    assert gains_of_efforts([none], [None, (40.0, 2.0)]) == [None, None]
+    assert gains_of_efforts([whole, none], [None, None]) == [None, None]
+
+
 def test_efforts_that_a_servo_does_not_give_drive_the_joints(tmp_path):
     scene, sidecar = servo_log(
         tmp_path, 80.0, 3.0, lambda e, v: 80.0 * e - 3.0 * v, gravity=4.0
