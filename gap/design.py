@@ -8,7 +8,6 @@ its surroundings on the way.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from xml.etree import ElementTree
 
 import numpy as np
 
@@ -30,7 +29,7 @@ from makebreak.models.effects.kind import (
     unit_at,
 )
 from makebreak.models.effects.signature import Motion
-from makebreak.models.model_export import models_of
+from makebreak.models.model_files import couplings_of, robot_files
 from makebreak.models.scene import Scene
 from makebreak.models.typed_yaml import nearest
 
@@ -136,6 +135,13 @@ class LogDesign:
                 "a log is designed for joints that turn or slide and are all driven; "
                 f"not driven: {', '.join(loose) or 'a free body'} (fixed_joints of the "
                 "scene holds a joint)"
+            )
+        tied = [f"{a} follows {b}" for a, b in couplings_of(scene).items()
+                if a in self.joints]  # fmt: skip
+        if tied:
+            raise ValueError(
+                f"a log is designed for joints that move alone: {', '.join(tied)} "
+                "(fixed_joints of the scene holds both)"
             )
         self.limits = _limits(scene, plant, joints, self.joints, plan)
         self.named = _named(self.dynamics, named)
@@ -258,16 +264,13 @@ def _is_linear(dynamics: SceneDynamics, kind: str, at: str) -> bool:
 
 
 def _effort_limits(scene: Scene) -> dict[str, float]:
-    """{<model>.<joint>: effort limit of its URDF}: Drake keeps none of a joint that has
-    no transmission."""
-    found = {}
-    for model, file in models_of(scene, ".urdf").items():
-        for joint in ElementTree.parse(file).getroot().iter("joint"):
-            for limit in joint.findall("limit"):
-                effort = float(limit.get("effort") or 0.0)
-                if effort > 0.0:  # 0 is where nobody thought of it.
-                    found[f"{model}.{joint.get('name')}"] = effort
-    return found
+    """{<model>.<joint>: effort limit of its file}: Drake keeps none of a URDF's joint
+    that has no transmission."""
+    return {
+        f"{model}.{joint}": limit
+        for model, file in robot_files(scene).items()
+        for joint, limit in file.limits.items()
+    }
 
 
 def _limits(scene: Scene, plant, joints, names, plan: LogPlan) -> Limits:

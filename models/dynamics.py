@@ -28,7 +28,9 @@ from makebreak.models.effects.kind import (
     Effect,
     find_body,
     full_name,
+    is_added,
     model_names,
+    model_of,
     one_dof_joints,
 )
 from makebreak.models.effects.signature import Grid, Motion, Signature
@@ -364,15 +366,14 @@ def places(loaded: LoadedScene, at: str, channels: Sequence[str]) -> list[str]:
     joints = [
         joint
         for joint in one_dof_joints(plant)
-        if joint.num_velocities()
-        and not plant.GetModelInstanceName(joint.model_instance()).startswith("motor_")
+        if joint.num_velocities() and not is_added(model_of(plant, joint))
     ]
     bodies = [
         plant.get_body(i)
         for model in model_names(plant)
         for i in plant.GetBodyIndices(plant.GetModelInstanceByName(model))
         if plant.get_body(i).index() != plant.world_body().index()
-        and not model.startswith(("payload_on_", "motor_of_"))
+        and not is_added(model)
     ]
     bodies.sort(key=lambda body: _depth(plant, body))  # From the base outwards.
     moving = [body for body in bodies if not plant.IsAnchored(body)]

@@ -5,6 +5,7 @@ of motion of the arm need to know only where they stand.
 """
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from xml.dom import expatbuilder, minidom
 from xml.parsers.expat import ExpatError
@@ -15,6 +16,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Joint, PrismaticJoint, WeldJoint
 
 from makebreak.models.effects.kind import actuator_of, full_name, one_dof_joints
+from makebreak.models.effects.model_text import children, text
 
 
 def fix_joints(
@@ -71,20 +73,40 @@ def coupled_joints(path: Path) -> dict[str, str]:
         return {}
 
 
+@dataclass(frozen=True)
+class Follows:
+    """A joint that is at factor times another one's position, plus offset [rad, m]."""
+
+    joint: str
+    factor: float
+    offset: float
+
+
 def couplings_in(text: str) -> dict[str, str]:
     """{joint: the one that it follows} of a model's text."""
+    return {joint: follows.joint for joint, follows in followers_in(text).items()}
+
+
+def followers_in(source: str) -> dict[str, Follows]:
+    """{joint: how it follows another} of a model's text."""
     # Drake knows `drake:` without a declaration of it.
-    return dict(_couplings(expatbuilder.parseString(text.encode(), namespaces=False)))
+    return dict(_couplings(expatbuilder.parseString(source.encode(), namespaces=False)))
 
 
-def _couplings(document: minidom.Document) -> Iterator[tuple[str, str]]:
+def _couplings(document: minidom.Document) -> Iterator[tuple[str, Follows]]:
     for mimic in document.getElementsByTagName("mimic"):
-        joint = mimic.parentNode
+        joint, said = mimic.parentNode, {}
+        for tag, default in (("multiplier", "1"), ("offset", "0")):
+            inside = [text(e) for e in children(mimic, tag)]  # SDF.
+            said[tag] = float(mimic.getAttribute(tag) or (*inside, default)[0])
         if isinstance(joint, minidom.Element) and joint.tagName == "axis":  # SDF.
             joint = joint.parentNode
         if isinstance(joint, minidom.Element):
-            yield joint.getAttribute("name"), mimic.getAttribute("joint")
+            other = mimic.getAttribute("joint")
+            yield joint.getAttribute("name"), Follows(other, *said.values())
     for equality in document.getElementsByTagName("equality"):  # MJCF.
         for pair in equality.getElementsByTagName("joint"):
             if pair.hasAttribute("joint2"):
-                yield pair.getAttribute("joint1"), pair.getAttribute("joint2")
+                law = [*map(float, pair.getAttribute("polycoef").split()), 0.0, 1.0]
+                other = pair.getAttribute("joint2")
+                yield pair.getAttribute("joint1"), Follows(other, law[1], law[0])

@@ -6,14 +6,13 @@ and rotor inertias. Effects that a format cannot express are listed in `omitted`
 """
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from xml.dom import minidom
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from xml.dom import expatbuilder, minidom
 from xml.etree import ElementTree as ET
 
 import numpy as np
-from pydrake.multibody.parsing import FlattenModelDirectives, ModelDirectives, Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
     Joint,
@@ -28,10 +27,12 @@ from makebreak.models.drives import law_of
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.inertia import central_inertia
 from makebreak.models.effects.kind import (
+    PAYLOAD_ON,
     Effect,
     actuator_of,
     find_joints,
     full_name,
+    is_added,
     model_of,
     one_dof_joints,
     sentence,
@@ -40,12 +41,15 @@ from makebreak.models.effects.model_text import (
     Inertial,
     children,
     make_mesh_paths_absolute,
-    model_path,
     set_text,
     write_inertial,
 )
+from makebreak.models.fixed_joints import followers_in
+from makebreak.models.model_files import robot_files
+from makebreak.models.robot_file import RobotFile
 from makebreak.models.scene import LoadedScene, Scene, load_scene
 from makebreak.models.scene_schema import COMMANDS_OF
+from makebreak.models.sdf_writer import sdf_of
 
 
 @dataclass(frozen=True)
@@ -101,7 +105,9 @@ def to_mjcf(scene: Scene) -> Exported:
     if len(motors):
         root.append(motors)
     ET.indent(root)
-    return Exported(ET.tostring(root, encoding="unicode") + "\n", _unsaid(scene))
+    stands = tuple(f"motion of joint {name}" for name in scene.fixed_joints)
+    text = ET.tostring(root, encoding="unicode") + "\n"
+    return Exported(text, _unsaid(scene) + stands)
 
 
 def to_urdf(scene: Scene, model: str) -> Exported:
@@ -109,24 +115,73 @@ def to_urdf(scene: Scene, model: str) -> Exported:
 
     Raises: ValueError if the model comes from no URDF.
     """
-    return _own_file(scene, model, ".urdf")
+    file = robot_files(scene).get(model)
+    if file is None or file.suffix != ".urdf":
+        raise ValueError(f"{model!r} comes from no URDF, so none can be written of it")
+    return _with_numbers(scene, model, file, _own_text(file))
 
 
 def to_sdf(scene: Scene, model: str) -> Exported:
-    """As to_urdf, of a model that comes from an SDF file."""
-    return _own_file(scene, model, ".sdf")
+    """As to_urdf: the model's own SDF, or one that is made of its URDF or MJCF.
+
+    Raises: ValueError if the model comes from none of these.
+    """
+    file = robot_files(scene).get(model)
+    if file is None:
+        raise ValueError(f"{model!r} comes from no URDF, SDF or MJCF")
+    # What the file lets move, as a gripper's fingers, moves in what is written.
+    scene = replace(scene, fixed_joints={})
+    if file.suffix == ".sdf":
+        return _with_numbers(scene, model, file, _own_text(file))
+    shapes = replace(scene.plant, shapes=True)
+    plain = _load(replace(scene, effects=[], plant=shapes))
+    plant = plain.plant
+    instance = plant.GetModelInstanceByName(model)
+    joints = [plant.get_joint(i) for i in plant.GetJointIndices(instance)]
+    welded = {
+        each.add_weld.child.partition("::")[0]
+        for each in scene.directives
+        if each.add_weld is not None
+    }
+    if model in welded:  # That is for the directive to say.
+        joints = [j for j in joints if j.parent_body().model_instance() == instance]
+    efforts = {name: drive.limit for name, drive in file.drives.items()}
+    efforts |= dict(file.limits)
+    for joint in joints:
+        own = actuator_of(plant, joint)
+        if own is not None:
+            efforts.setdefault(joint.name(), float(own.effort_limit()))
+    text, renamed, lost = sdf_of(
+        plant, plain.scene_graph.model_inspector(), model, joints, efforts,
+        followers_in(file.text),
+    )  # fmt: skip
+    made = _with_numbers(scene, model, file, text.encode(), renamed)
+    lost += tuple(
+        f"joint {old} is called {new}, as a link has its name"
+        for old, new in renamed.items()
+    )
+    return Exported(made.text, lost + made.omitted)
 
 
-def _own_file(scene: Scene, model: str, suffix: str) -> Exported:
-    files = models_of(scene, suffix)
-    if model not in files:
-        kind = suffix[1:].upper()
-        raise ValueError(
-            f"{model!r} comes from no {kind}, so none can be written of it"
-        )
+def _own_text(file: RobotFile) -> bytes:
+    """As its author wrote it, where that is no xacro."""
+    is_plain = file.path.suffix.lower() == file.suffix
+    return file.path.read_bytes() if is_plain else file.text.encode()
+
+
+def _with_numbers(
+    scene: Scene,
+    model: str,
+    file: RobotFile,
+    text: bytes,
+    renamed: Mapping[str, str] = MappingProxyType({}),
+) -> Exported:
+    """A model's URDF or SDF with the inertias, damping, friction and rotors that it has
+    in the scene. renamed: {joint: its name in the text}, where that is another."""
     loaded = _load(scene)
     plant = loaded.plant
-    document = minidom.parse(str(files[model]))
+    # Keeps prefixes such as drake: as they are, and known without a declaration.
+    document = expatbuilder.parseString(text, namespaces=False)
     instance = plant.GetModelInstanceByName(model)
     payloads = payloads_of(plant)
     for link in document.getElementsByTagName("link"):
@@ -140,7 +195,7 @@ def _own_file(scene: Scene, model: str, suffix: str) -> Exported:
             own = link.appendChild(document.createElement("inertial"))
             mass = own.appendChild(document.createElement("mass"))
             inertia = own.appendChild(document.createElement("inertia"))
-            if suffix == ".urdf":
+            if document.getElementsByTagName("robot"):
                 mass.setAttribute("value", "0")
             else:
                 inertia.appendChild(document.createElement("ixx"))
@@ -149,8 +204,9 @@ def _own_file(scene: Scene, model: str, suffix: str) -> Exported:
     for index in plant.GetJointIndices(instance):
         joint = plant.get_joint(index)
         if isinstance(joint, (RevoluteJoint, PrismaticJoint)):
-            omitted += _file_joint(loaded, joint, document)
-    make_mesh_paths_absolute(document, files[model].parent)
+            there = renamed.get(joint.name(), joint.name())
+            omitted += _file_joint(loaded, joint, document, there)
+    make_mesh_paths_absolute(document, file.path.parent)
     return Exported(document.toxml() + "\n", tuple(omitted))
 
 
@@ -160,21 +216,9 @@ def formats_of(scene: Scene) -> list[str]:
         _load(scene)
     except ValueError:  # It has a body that moves freely.
         return []
-    return [k for k in ("urdf", "sdf") if models_of(scene, f".{k}")] + ["mjcf"]
-
-
-def models_of(scene: Scene, suffix: str) -> dict[str, Path]:
-    """{model: its file} of the models that come from such files (.urdf or .sdf)."""
-    parser = Parser(MultibodyPlant(0.0))
-    flat = FlattenModelDirectives(
-        ModelDirectives(directives=scene.directives), parser.package_map()
-    )
-    files = {
-        d.add_model.name: model_path(d.add_model.file, parser.package_map())
-        for d in flat.directives
-        if d.add_model is not None
-    }
-    return {name: file for name, file in files.items() if file.suffix == suffix}
+    files = robot_files(scene).values()
+    is_urdf = any(file.suffix == ".urdf" for file in files)
+    return ["urdf"] * is_urdf + ["sdf"] * bool(files) + ["mjcf"]
 
 
 def _load(scene: Scene) -> LoadedScene:
@@ -198,17 +242,12 @@ def _load(scene: Scene) -> LoadedScene:
     return loaded
 
 
-def is_added(model: str) -> bool:
-    """Whether load_scene has added a model for an effect (payload, elastic motor)."""
-    return model.startswith(("payload_on_", "motor_of_"))
-
-
 def payloads_of(plant: MultibodyPlant) -> dict[int, list[RigidBody]]:
     """{index of a body: the payloads that are welded to it}."""
     found: dict[int, list[RigidBody]] = {}
     for joint in (plant.get_joint(i) for i in plant.GetJointIndices()):
         body = joint.child_body()
-        if model_of(plant, body).startswith("payload_on_"):
+        if model_of(plant, body).startswith(PAYLOAD_ON):
             found.setdefault(int(joint.parent_body().index()), []).append(body)
     return found
 
@@ -338,8 +377,8 @@ newer, where joint friction is an effort).
     ArticulationCfg(..., actuators=ACTUATORS)
 
 The law is effort = clip(stiffness (target - q) + damping (velocity target - v) + effort
-target), with targets that arrive late by the delay. Masses and inertias are not here:
-`--export urdf` has them.
+target), with targets that arrive late by the delay. Without an effort limit here, that
+of the asset holds. Masses and inertias are not here: `--export urdf` has them.
 """
 
 from isaaclab.actuators import DelayedPDActuatorCfg
@@ -352,24 +391,25 @@ ACTUATORS = {
 
 def to_isaac_lab(scene: Scene) -> Exported:
     """The scene's drives as a Python module for Isaac Lab: a DelayedPDActuatorCfg for
-    the joints of each delay, with stiffness, damping, effort limit, armature and
-    friction.
+    the joints of each delay, with stiffness, damping, effort limit (where there is
+    one), armature and friction.
 
     Raises: ValueError as to_mjcf, or if the scene drives no joint.
     """
     loaded = _load(scene)
     plant = loaded.plant
-    groups: dict[float, dict[str, JointNumbers]] = {}
+    groups: dict[tuple[float, bool], dict[str, JointNumbers]] = {}
     for joint in one_dof_joints(plant):
         drive = joint_numbers(loaded, joint)
         if drive.is_driven and not is_added(model_of(plant, joint)):
-            groups.setdefault(drive.delay, {})[re.escape(joint.name())] = drive
+            group = groups.setdefault((drive.delay, bool(np.isfinite(drive.limit))), {})
+            group[re.escape(joint.name())] = drive
     if not groups:
         raise ValueError("--export isaaclab: the scene drives no joint")
     text = _ISAAC_LAB
-    for k, (delay, drives) in enumerate(sorted(groups.items())):
+    for k, ((delay, is_limited), drives) in enumerate(sorted(groups.items())):
         values = {
-            "effort_limit": [min(d.limit, 1e9) for d in drives.values()],
+            "effort_limit": [d.limit for d in drives.values()],
             "stiffness": [d.kp for d in drives.values()],
             "damping": [d.kd for d in drives.values()],
             "armature": [d.armature for d in drives.values()],
@@ -377,6 +417,8 @@ def to_isaac_lab(scene: Scene) -> Exported:
             "dynamic_friction": [d.friction for d in drives.values()],
             "viscous_friction": [d.damping for d in drives.values()],
         }
+        if not is_limited:
+            del values["effort_limit"]
         text += f'    "drives_{k + 1}": DelayedPDActuatorCfg(\n'
         text += f"        joint_names_expr={list(drives)!r},\n"
         for name, numbers in values.items():
@@ -388,13 +430,13 @@ def to_isaac_lab(scene: Scene) -> Exported:
     return Exported(text + "}\n", _unsaid(scene, ("delay",)))
 
 
-def _file_joint(loaded: LoadedScene, joint: Joint, document) -> list[str]:
-    """Writes a joint's damping, friction and rotor into a URDF or an SDF file. Returns:
-    what cannot be written."""
+def _file_joint(loaded: LoadedScene, joint: Joint, document, there: str) -> list[str]:
+    """Writes a joint's damping, friction and rotor into a URDF or an SDF file, where
+    `there` is its name. Returns: what cannot be written."""
     plant = loaded.plant
     (element,) = [
         e for e in document.getElementsByTagName("joint")
-        if e.getAttribute("name") == joint.name() and e.hasAttribute("type")
+        if e.getAttribute("name") == there and e.hasAttribute("type")
     ]  # fmt: skip
     dynamics = {
         "damping": repr(float(joint.default_damping_vector()[0])),

@@ -91,21 +91,25 @@ def add_models(scene: Scene, effects: Sequence[Effect], plant: MultibodyPlant) -
         fix_joints(plant, scene.fixed_joints, len(couplings_of(scene)))
 
 
-def couplings_of(scene: Scene) -> dict[str, str]:
-    """{<model>.<joint>: the one that it follows} of the models' files."""
-    packages = PackageMap()
+def robot_files(scene: Scene) -> dict[str, RobotFile]:
+    """{model: its file} of the models that come from files of robots."""
+    packages, found = PackageMap(), {}
     _add_packages(scene, packages)
-    found: dict[str, str] = {}
     for directive in _flattened(scene.directives, packages).directives:
         add = directive.add_model
         path = None if add is None else path_of(add.file, Path("/"), packages)
-        if add is not None and path is not None and is_robot(path):
-            text = read_robot_file(path, packages, bare=True).text
-            found |= {
-                f"{add.name}.{joint}": f"{add.name}.{other}"
-                for joint, other in couplings_in(text).items()
-            }
+        if add is not None and path is not None and is_robot(path) and path.is_file():
+            found[add.name] = read_robot_file(path, packages, bare=True)
     return found
+
+
+def couplings_of(scene: Scene) -> dict[str, str]:
+    """{<model>.<joint>: the one that it follows} of the models' files."""
+    return {
+        f"{model}.{joint}": f"{model}.{other}"
+        for model, file in robot_files(scene).items()
+        for joint, other in couplings_in(file.text).items()
+    }
 
 
 def with_what_files_say(scene: Scene) -> Scene:
@@ -113,24 +117,16 @@ def with_what_files_say(scene: Scene) -> Scene:
     place for, as effects: dry friction, rotors, springs; and with the positions of
     their first keyframe, where the scene has no initial state. What the scene itself
     says of a joint counts, and joints that do not move have none."""
-    packages = PackageMap()
-    _add_packages(scene, packages)
     named = {(e.kind, at) for e in scene.effects for at in e.at}
     effects = list(scene.effects)
     home: dict[str, float] = {}
-    for directive in _flattened(scene.directives, packages).directives:
-        add = directive.add_model
-        path = None if add is None else path_of(add.file, Path("/"), packages)
-        if path is None or not is_robot(path) or not path.is_file():
-            continue
-        assert add is not None
-        file = read_robot_file(path, packages, bare=True)
+    for model, file in robot_files(scene).items():
         for effect in file.effects:
-            at = f"{add.name}.{effect.at[0]}"
-            is_said = {(effect.kind, at), (effect.kind, add.name)} & named
+            at = f"{model}.{effect.at[0]}"
+            is_said = {(effect.kind, at), (effect.kind, model)} & named
             if at not in scene.fixed_joints and not is_said:
                 effects.append(replace(effect, at=[at]))
-        home |= {f"{add.name}.{joint}": q for joint, q in file.home.items()}
+        home |= {f"{model}.{joint}": q for joint, q in file.home.items()}
     home = {joint: q for joint, q in home.items() if joint not in scene.fixed_joints}
     initial = scene.initial
     if home and not initial.positions and not scene.initial_of:

@@ -45,13 +45,13 @@ from makebreak.models.effects.contact import CONTACT_LAW, FRICTION
 from makebreak.models.effects.kind import (
     Effect,
     full_name,
+    is_added,
     model_of,
     one_dof_joints,
 )
 from makebreak.models.mjcf import named_spec, rotation
 from makebreak.models.model_export import (
     inertial_of,
-    is_added,
     joint_numbers,
     payloads_of,
 )

@@ -23,7 +23,7 @@ from makebreak.gap.numerics.excitation import (
 )
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.model_export import to_mjcf
-from makebreak.models.scene import ActuationSection
+from makebreak.models.scene import ActuationSection, read_scene
 from makebreak.models.scene_file import write_scene
 from makebreak.models.typed_yaml import read_yaml
 from makebreak.scripts.cli import main
@@ -297,3 +297,31 @@ def test_gap_knows_more_from_a_designed_log_than_from_random_ones(tmp_path):
     # The product of the deviations is what the design makes small.
     for other in random:
         assert np.prod(designed) < np.prod(other)
+
+
+def test_a_gripper_whose_fingers_go_together_stands_still(tmp_path, capsys):
+    """No robot could play a motion of one finger alone."""
+    pendulum(tmp_path)
+    file = next(tmp_path.glob("*.urdf"))
+    finger = """<link name="{0}"><inertial><mass value="0.1"/><inertia ixx="1e-4"
+    iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial></link>
+    <joint name="{0}" type="prismatic"><parent link="rod"/><child link="{0}"/>
+    <axis xyz="0 1 0"/><limit lower="0.01" upper="0.1" effort="5" velocity="1"/>{1}
+    </joint>"""
+    mimic = '<mimic joint="left" multiplier="2" offset="0.005"/>'
+    more = finger.format("right", mimic) + finger.format("left", "")
+    file.write_text(file.read_text().replace("</robot>", f"{more}</robot>"))
+    words = ["design-log", str(file), "--seconds", "6", "--period", "3"]
+    words += ["--harmonics", "2", "--for", "joint_viscous_damping", "--velocity", "4"]
+    out = tmp_path / "out"
+    assert main([*words, "--effort", "15", "--out", str(out)]) == 0
+    assert "still throughout: p.left 0.01, p.right 0.025" in capsys.readouterr().out
+    scene = read_scene(out / "scene.yaml")
+    assert scene.fixed_joints == {"p.left": 0.01, "p.right": 0.025}
+    assert [n for n in read_recording(out / "design.csv").channels] == [
+        f"p.j1.{what}_command" for what in ("position", "velocity", "effort")
+    ]
+    loose = replace(scene, fixed_joints={})
+    loose.actuation.joints += ["p.left", "p.right"]
+    with pytest.raises(ValueError, match="move alone: p.right follows p.left"):
+        LogDesign(loose, ["joint_viscous_damping"], PLAN)

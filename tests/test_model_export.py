@@ -1,5 +1,6 @@
 """A repaired scene as MJCF and URDF: the same mechanism in MuJoCo and in Drake."""
 
+import copy
 import sys
 import types
 from dataclasses import replace
@@ -9,13 +10,14 @@ import mujoco
 import numpy as np
 import pytest
 from effect_scenes import at_rest_but, double, on_ground, pendulum, with_effects
+from pydrake.geometry import GeometrySet, Role
 from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.gap.simulation.commands import Commands
 from makebreak.gap.simulation.scene_simulation import SceneSimulation
 from makebreak.models.effects.kind import Effect
-from makebreak.models.model_export import formats_of, to_mjcf, to_urdf
-from makebreak.models.scene import ActuationSection, load_scene
+from makebreak.models.model_export import formats_of, to_mjcf, to_sdf, to_urdf
+from makebreak.models.scene import ActuationSection, InitialSection, load_scene
 from makebreak.models.scene_schema import SupplySection
 from makebreak.scripts.cli.gap_command import exported
 
@@ -172,6 +174,12 @@ def test_drives_for_isaac_lab_do_in_mujoco_what_ours_do(tmp_path, monkeypatch):
     np.testing.assert_allclose(replayed, rows, atol=0.01)  # As above.
 
 
+def test_an_effort_without_a_limit_leaves_that_of_the_asset(tmp_path):
+    text = exported(double(tmp_path), ["isaaclab"])["isaaclab_actuators.py"]
+    assert "stiffness={'j1': 0.0, 'j2': 0.0}" in text
+    assert "effort_limit" not in text
+
+
 def test_a_urdf_has_what_the_repaired_scene_has(tmp_path):
     base = with_effects(pendulum(tmp_path), ("rotor_inertia", "p", dict(inertia=0.07)))
     more = [
@@ -250,6 +258,150 @@ def test_sdf_moves_as_the_scene(tmp_path):
     assert said == [0.4, 0.0]  # Drake reads no friction; Gazebo does.
 
 
+# An arm with a gripper whose fingers go together; a link and a joint of one name.
+GRIPPER = """<robot name="d"><link name="base"/>
+<link name="fore"><inertial><origin xyz="0.1 0.02 0" rpy="0.2 0 0.1"/><mass value="1"/>
+<inertia ixx="0.01" iyy="0.02" izz="0.02" ixy="0" ixz="0.001" iyz="0"/></inertial>
+<collision><origin xyz="0.1 0 0" rpy="0 1.2 0"/><geometry>
+<cylinder radius="0.02" length="0.2"/></geometry></collision>
+<visual><geometry><box size="0.1 0.2 0.3"/></geometry></visual></link>
+<link name="tool"><inertial><mass value="0.2"/>
+<inertia ixx="0.001" iyy="0.001" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial>
+<collision><geometry><sphere radius="0.03"/></geometry></collision></link>
+<link name="finger"><inertial><origin xyz="0.02 0 0"/><mass value="0.1"/>
+<inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<link name="other"><inertial><origin xyz="0.02 0 0"/><mass value="0.15"/>
+<inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="fore" type="revolute"><parent link="base"/><child link="fore"/>
+<origin xyz="0 0.1 0.2" rpy="0.3 0.2 0.1"/><axis xyz="0 0.6 0.8"/>
+<limit lower="-2" upper="1" effort="30" velocity="3"/><dynamics damping="0.1"/></joint>
+<joint name="flange" type="fixed"><parent link="fore"/><child link="tool"/>
+<origin xyz="0.3 0 0" rpy="0 0.5 0"/></joint>
+<joint name="left" type="prismatic"><parent link="tool"/><child link="finger"/>
+<origin xyz="0.1 0 0" rpy="0 0 0.4"/><axis xyz="0 1 0"/>
+<limit lower="0" upper="0.05" effort="20" velocity="0.1"/></joint>
+<joint name="right" type="prismatic"><parent link="tool"/><child link="other"/>
+<origin xyz="0.1 0 0"/><axis xyz="0 -1 0"/><mimic joint="left" multiplier="0.5"
+offset="0.01"/><limit lower="0" upper="0.05" effort="20" velocity="0.1"/></joint>
+</robot>"""
+# Bodies that stand in joints off their origin, one that is welded to the world.
+CRANE = """<mujoco model="d"><compiler angle="radian"/><worldbody>
+<body name="base" pos="0 0 .1"><geom type="box" size=".1 .2 .05" mass="3"/>
+<body name="column" pos="0 .1 .2" euler=".3 .1 0"><joint name="yaw" axis="0 .3 1"
+pos=".05 0 .1" range="-2 1" damping=".2" frictionloss=".1" armature=".02"/>
+<geom type="capsule" fromto="0 0 0 .2 0 .1" size=".03" mass="1"/>
+<body name="arm" pos=".2 0 .1" euler="0 .4 0"><joint name="slide" type="slide"
+axis="1 0 0" range="0 .3" pos="0 .1 0"/><geom type="ellipsoid" size=".1 .05 .04"
+mass=".7"/></body><body name="twin" pos="0 0 .3"><joint name="turn" axis="0 1 0"/>
+<geom type="cylinder" size=".03 .1" mass=".4"/></body></body></body></worldbody>
+<equality><joint joint1="turn" joint2="slide" polycoef=".2 3 0 0 0"/></equality>
+<actuator><position joint="yaw" kp="50" kv="4" forcerange="-25 25"/></actuator>
+</mujoco>"""
+
+
+def shapes(scene_graph, context):
+    """Every shape of the bodies that move: its role, kind and place in the world."""
+    query = scene_graph.get_query_output_port().Eval(
+        scene_graph.GetMyContextFromRoot(context)
+    )
+    inspector = query.inspector()
+    return sorted(
+        (str(role), type(inspector.GetShape(g)).__name__,
+         *query.GetPoseInWorld(g).GetAsMatrix34().ravel().round(9))
+        for role in (Role.kProximity, Role.kIllustration)
+        for g in inspector.GetGeometryIds(GeometrySet(inspector.GetAllGeometryIds()),
+                                          role)
+        if inspector.GetFrameId(g) != inspector.world_frame_id()
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("which", ["urdf", "mjcf"])
+def test_sdf_that_is_made_of_another_file_moves_as_the_scene(tmp_path, which):
+    base = double(tmp_path)
+    path, joint, body = {
+        "urdf": (tmp_path / "grip.urdf", "d.fore", "d.tool"),
+        "mjcf": (tmp_path / "crane.xml", "d.yaw", "d.arm"),
+    }[which]
+    path.write_text(GRIPPER if which == "urdf" else CRANE)
+    base.directives[0].add_model.file = f"file://{path}"
+    if which == "mjcf":  # Its own file welds its base.
+        base.directives.pop()
+    actuation = ActuationSection(type="effort", joints=[joint])
+    effects = (
+        ("joint_viscous_damping", joint, dict(damping=0.2)),
+        ("rotor_inertia", joint, dict(inertia=0.05)),
+        ("payload", body, dict(mass=0.4, com_x=0.05, com_y=0.01, com_z=-0.04)),
+        LOST[:1] + (joint,) + LOST[2:],
+    )
+    plain = replace(base, actuation=actuation, initial=InitialSection())
+    scene = with_effects(plain, *effects)
+    one = "d.left" if which == "urdf" else "d.slide"
+    two = "d.right" if which == "urdf" else "d.turn"
+    still = replace(scene, fixed_joints={one: 0.01, two: 0.02})
+    text = exported(still, ["sdf"])["d.sdf"]
+    assert f"motion of joint {one}" in exported(still, ["mjcf"])["repaired.xml"]
+    assert ("joint fore is called fore_joint" in text) == (which == "urdf")
+    assert "joint d.fore has drag" in text or "joint d.yaw has drag" in text
+    (tmp_path / "again.sdf").write_text(text)
+    again = copy.deepcopy(plain)
+    again.directives[0].add_model.file = f"file://{tmp_path / 'again.sdf'}"
+    if which == "urdf":
+        joint = "d.fore_joint"
+    again.actuation.joints = [joint]
+    found = []
+    for each in (scene, again):
+        builder = DiagramBuilder()
+        loaded = load_scene(each, builder)
+        plant, diagram = loaded.plant, builder.Build()
+        context = diagram.CreateDefaultContext()
+        own = plant.GetMyMutableContextFromRoot(context)
+        q = np.random.default_rng(0).uniform(-1.0, 1.0, plant.num_positions())
+        plant.SetPositions(own, q)
+        plant.SetVelocities(own, q)
+        moving = [plant.get_joint(i) for i in plant.GetJointIndices()]
+        moving = [j for j in moving if j.num_velocities()]
+        limits = [
+            [*j.position_lower_limits(), *j.position_upper_limits(),
+             *j.velocity_upper_limits(), *j.default_damping_vector()]
+            for j in moving
+        ]  # fmt: skip
+        found.append((
+            plant.CalcMassMatrix(own), plant.CalcGravityGeneralizedForces(own),
+            plant.CalcBiasTerm(own), limits,
+            shapes(loaded.scene_graph, context),
+        ))  # fmt: skip
+    for a, b in zip(found[0][:4], found[1][:4], strict=True):
+        np.testing.assert_allclose(b, a, rtol=1e-9, atol=1e-12)
+    assert found[0][4] == found[1][4] and len(found[0][4]) >= 3
+    assert plant.num_constraints() == 1  # Drake has none of an MJCF file.
+    root = ET.fromstring(text)
+    mimic = root.find(".//axis/mimic")
+    said = [
+        mimic.get("joint"),
+        *(float(mimic.find(t).text) for t in ("multiplier", "offset")),
+    ]
+    assert said == (["left", 0.5, 0.01] if which == "urdf" else ["slide", 3.0, 0.2])
+    efforts = [float(e.text) for e in root.iter("effort")]
+    assert efforts == ([30.0, 20.0, 20.0] if which == "urdf" else [25.0, 0.0, 0.0])
+
+
+def test_a_urdf_is_written_of_a_xacro(tmp_path):
+    scene = double(tmp_path)
+    (file,) = tmp_path.glob("*.urdf")
+    text = file.read_text().replace(
+        '<robot name="d">',
+        '<robot name="d" xmlns:xacro="http://www.ros.org/wiki/xacro">'
+        '<xacro:property name="heavy" value="${1 + 1.5}"/>',
+    )
+    file.with_suffix(".xacro").write_text(
+        text.replace('value="0.8"', 'value="${heavy}"')
+    )
+    scene.directives[0].add_model.file = f"file://{file.with_suffix('.xacro')}"
+    text = exported(scene, ["urdf"])["d.urdf"]
+    masses = [float(m.get("value")) for m in ET.fromstring(text).iter("mass")]
+    assert masses == [1.5, 2.5]
+
+
 def test_what_a_format_cannot_say_is_told(tmp_path):
     scene = with_effects(double(tmp_path), *SAID, LOST)
     (said,) = to_mjcf(scene).omitted
@@ -259,13 +411,14 @@ def test_what_a_format_cannot_say_is_told(tmp_path):
     assert [("rotor" in each) for each in omitted] == [False, True, True]
     with pytest.raises(ValueError, match="b.box: only mechanisms"):
         to_mjcf(on_ground(tmp_path, "cube"))
-    with pytest.raises(ValueError, match="'q' comes from no URDF"):
-        to_urdf(scene, "q")
+    for write in (to_urdf, to_sdf):
+        with pytest.raises(ValueError, match="'q' comes from no URDF"):
+            write(scene, "q")
 
 
 def test_what_is_offered_can_be_written(tmp_path):
     scene = double(tmp_path)
-    assert formats_of(scene) == ["urdf", "mjcf"]
+    assert formats_of(scene) == ["urdf", "sdf", "mjcf"]
     assert exported(scene, formats_of(scene))
     (tmp_path / "d.sdf").write_text(SDF)
     scene.directives[0].add_model.file = f"file://{tmp_path / 'd.sdf'}"
@@ -282,7 +435,5 @@ def test_the_command_writes_what_is_asked_for(tmp_path):
     in_mujoco(files["repaired.xml"])  # A comment after the end is no error.
     with pytest.raises(ValueError, match="--export: got 'step', expected some of urdf"):
         exported(scene, ["step"])
-    with pytest.raises(ValueError, match="no model of the scene comes from SDF"):
-        exported(scene, ["sdf"])
     with pytest.raises(ValueError, match="no model of the scene comes from URDF"):
         exported(on_ground(tmp_path, "cube"), ["urdf"])

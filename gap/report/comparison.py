@@ -29,7 +29,13 @@ from pydrake.systems.framework import Context, DiagramBuilder
 from makebreak.gap.data.recording import Recording
 from makebreak.gap.report.clock import zero_of
 from makebreak.gap.result import GapResult, Series, plain
-from makebreak.models.effects.kind import full_name, one_dof_joints, sliding_joints
+from makebreak.models.effects.kind import (
+    full_name,
+    is_added,
+    model_of,
+    one_dof_joints,
+    sliding_joints,
+)
 from makebreak.models.meshes import coarse
 from makebreak.models.scene import LoadedScene, Scene, initial_for, load_scene
 
@@ -204,7 +210,7 @@ def _position_channels(plant: MultibodyPlant) -> list[str]:
     names = [
         f"{full_name(plant, joint)}.position"
         for joint in one_dof_joints(plant)
-        if not full_name(plant, joint).startswith("motor_of_")
+        if not is_added(model_of(plant, joint))
     ]
     for index in sorted(plant.GetFloatingBaseBodies(), key=int):
         name = full_name(plant, plant.get_body(index))
@@ -384,7 +390,7 @@ def _sticks(plant: MultibodyPlant, context: Context) -> list:
     for i in range(1, plant.num_bodies()):
         body = plant.get_body(BodyIndex(i))
         name = full_name(plant, body)
-        if plant.IsAnchored(body) or name.startswith(("motor_of_", "payload_on_")):
+        if plant.IsAnchored(body) or is_added(name):
             continue
         ends = [
             joint.frame_on_parent().GetFixedPoseInBodyFrame().translation()

@@ -5,8 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from pydrake.multibody.tree import ModelInstanceIndex, RigidBody
 
-from makebreak.gap.simulation.scene_diagram import MOTOR_OF
-from makebreak.models.effects.kind import full_name, one_dof_joints
+from makebreak.models.effects.kind import full_name, is_added, one_dof_joints
 from makebreak.models.effects.transmission import motor_joint
 from makebreak.models.scene import LoadedScene, actuators_of_model
 
@@ -93,7 +92,7 @@ class SceneChannels:
         self.joints = {}
         for joint in one_dof_joints(plant):
             name = full_name(plant, joint)
-            if not name.startswith(MOTOR_OF):
+            if not is_added(name):
                 self.joints[name] = joint
             motor = motor_joint(plant, joint)
             for what in ("position", "velocity"):
@@ -116,9 +115,7 @@ class SceneChannels:
             model = plant.GetModelInstanceName(instance)
             for index in plant.GetBodyIndices(instance):
                 body = plant.get_body(index)
-                if plant.IsAnchored(body) or model.startswith(
-                    (MOTOR_OF, "payload_on_")
-                ):
+                if plant.IsAnchored(body) or is_added(model):
                     continue
                 name = f"{model}.{body.name()}"
                 self.bodies[name] = body
@@ -136,7 +133,7 @@ class SceneChannels:
         plant = self._plant
         for i in range(plant.num_model_instances()):
             model = plant.GetModelInstanceName(ModelInstanceIndex(i))
-            if model.startswith(MOTOR_OF):
+            if is_added(model):
                 continue
             for k, actuator in enumerate(actuators_of_model(plant, model)):
                 name = f"{full_name(plant, actuator.joint())}.effort_measured"

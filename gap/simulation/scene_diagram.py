@@ -9,7 +9,7 @@ from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import Demultiplexer, LogVectorOutput
 
-from makebreak.models.effects.kind import full_name, one_dof_joints
+from makebreak.models.effects.kind import full_name, is_added, one_dof_joints
 from makebreak.models.scene import (
     LoadedScene,
     Scene,
@@ -17,7 +17,6 @@ from makebreak.models.scene import (
     load_scene,
 )
 
-MOTOR_OF = "motor_of_"  # Begins the model of a motor behind something elastic.
 STATE_LOG = "state_log"
 
 
@@ -51,7 +50,7 @@ def make_scene_diagram(
     for i in range(plant.num_model_instances()):
         instance = ModelInstanceIndex(i)
         model = plant.GetModelInstanceName(instance)
-        if model.startswith(MOTOR_OF):
+        if is_added(model):
             continue
         _export_actuation(builder, loaded, model)
         _export_joints(builder, loaded, instance)

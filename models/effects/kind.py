@@ -469,6 +469,16 @@ def model_of(plant: MultibodyPlant, element: Joint | RigidBody) -> str:
     return plant.GetModelInstanceName(element.model_instance())
 
 
+# What load_scene adds for an effect: models of one body.
+PAYLOAD_ON, MOTOR_OF = "payload_on_", "motor_of_"
+
+
+def is_added(model: str) -> bool:
+    """Whether a model is a payload, or a motor behind something elastic, and none of
+    the scene's own."""
+    return model.startswith((PAYLOAD_ON, MOTOR_OF))
+
+
 def full_name(plant: MultibodyPlant, element: Joint | RigidBody) -> str:
     """`<model>.<joint>` or `<model>.<body>`, as scenes and recordings name it."""
     return f"{model_of(plant, element)}.{element.name()}"

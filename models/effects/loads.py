@@ -17,6 +17,7 @@ from makebreak.models.effects.inertia import (
     ten_parameters,
 )
 from makebreak.models.effects.kind import (
+    PAYLOAD_ON,
     Effect,
     EffectKind,
     Parameter,
@@ -37,7 +38,7 @@ _PROBE_ARM, _USUAL_ARM = 0.05, 0.1  # Of small point masses, and of a load [m].
 
 
 def _payload_name(plant: MultibodyPlant, body: RigidBody) -> str:
-    return f"payload_on_{full_name(plant, body).replace('.', '_')}"
+    return f"{PAYLOAD_ON}{full_name(plant, body).replace('.', '_')}"
 
 
 def _payload_inertia(effect: Effect) -> SpatialInertia:

@@ -29,6 +29,7 @@ from pydrake.systems.framework import (
 from scipy.optimize import brentq
 
 from makebreak.models.effects.kind import (
+    MOTOR_OF,
     Effect,
     EffectKind,
     Parameter,
@@ -49,7 +50,7 @@ CONTACT_DAMPING = 0.3  # Its damping ratio, where no restitution is given.
 
 def motor_model(plant: MultibodyPlant, joint: Joint) -> str:
     """Name of the model instance of the joint's motor."""
-    return f"motor_of_{full_name(plant, joint).replace('.', '_')}"
+    return f"{MOTOR_OF}{full_name(plant, joint).replace('.', '_')}"
 
 
 def motor_joint(plant: MultibodyPlant, joint: Joint) -> Joint | None:

@@ -14,6 +14,7 @@ import numpy as np
 from makebreak.gap.data.robot import directives_of, read_robot
 from makebreak.gap.data.table import write_recording
 from makebreak.gap.design import DesignedLog, LogDesign, LogPlan
+from makebreak.models.fixed_joints import followers_in
 from makebreak.models.scene import Scene, read_scene
 from makebreak.scripts.cli.arguments import number
 from makebreak.scripts.cli.gap_command import StageBar, name_from
@@ -51,7 +52,7 @@ def design_log(
             found = LogDesign(scene, named, plan).solve(progress)
         write_recording(out.file("design.csv"), found.columns())
         _draw(found, out.file("design.png"))
-        table = _table(found)
+        table = _table(found, scene)
         told = [
             json_value(dict(vars(p))) | {"told": p.is_told} for p in found.predicted
         ]
@@ -63,18 +64,33 @@ def design_log(
 
 
 def _scene_of_robot(path: Path, out: OutputFolder) -> Scene:
-    """The robot upright on the world, its joints driven by efforts."""
+    """The robot upright on the world, its joints driven by efforts. Those that others
+    follow, as a gripper's fingers, stand still with these."""
     robot, file = read_robot(path), out.file("scene.yaml")
     lines, copies, _ = directives_of(robot)
     for name, text in copies.items():
         out.file(name).write_text(text)
-    joints = ", ".join(joint.name for joint in robot.joints)
-    lines.append(f"actuation: {{type: effort, joints: [{joints}]}}")
+    follows = followers_in(robot.file.text)
+    tied = dict.fromkeys([*(law.joint for law in follows.values()), *follows])
+    limits = {joint.name.partition(".")[2]: joint for joint in robot.joints}
+
+    def stands(name: str) -> float:
+        if name in follows:
+            law = follows[name]
+            return law.factor * stands(law.joint) + law.offset
+        home = robot.file.home.get(name, 0.0)
+        return float(np.clip(home, limits[name].lower, limits[name].upper))
+
+    if tied:
+        where = ", ".join(f"{robot.model}.{name}: {stands(name):.6g}" for name in tied)
+        lines.append(f"fixed_joints: {{{where}}}  # They move together (mimic).")
+    moving = [joint.name for name, joint in limits.items() if name not in tied]
+    lines.append(f"actuation: {{type: effort, joints: [{', '.join(moving)}]}}")
     file.write_text("\n".join(lines) + "\n")
     return read_scene(file)
 
 
-def _table(found: DesignedLog) -> Table:
+def _table(found: DesignedLog, scene: Scene) -> Table:
     rows: list[tuple] = []
     for p in found.predicted:
         after = p.after if p.is_told else "not told by efforts"
@@ -92,6 +108,9 @@ def _table(found: DesignedLog) -> Table:
         "Collisions of the robot with itself and its surroundings are not looked at: "
         "play it slowly first.",
     ]
+    if scene.fixed_joints:
+        still = ", ".join(f"{joint} {q:.4g}" for joint, q in scene.fixed_joints.items())
+        notes.insert(2, f"These stand still throughout: {still}.")
     return Table(
         "What the log will tell", ("parameter", "at", "standard deviation", "unit"),
         rows, notes=notes,

@@ -306,19 +306,19 @@ def name_from(folder: Path, robot: Path, proposed_scene: Path) -> None:
 
 def exported(scene: Scene, formats: Sequence[str]) -> dict[str, str]:
     """{file name: text} of a scene's models in other formats: `repaired.xml` (MJCF),
-    `isaaclab_actuators.py`, and `<model>.urdf` or `<model>.sdf` for each model that
-    comes from such a file.
+    `isaaclab_actuators.py`, `<model>.sdf` for each model, and `<model>.urdf` for each
+    that comes from one.
     Effects that a format cannot express are listed in a comment at its end.
 
     Raises: ValueError for an unknown format, or a scene that it cannot express.
     """
     from makebreak.models.model_export import (
-        models_of,
         to_isaac_lab,
         to_mjcf,
         to_sdf,
         to_urdf,
     )
+    from makebreak.models.model_files import robot_files
 
     found = {}
     for each in formats:
@@ -338,10 +338,12 @@ def exported(scene: Scene, formats: Sequence[str]) -> dict[str, str]:
         if each == "isaaclab":
             found["isaaclab_actuators.py"] = to_isaac_lab(scene)
             continue
-        models = models_of(scene, f".{each}")
+        files = robot_files(scene)
+        models = [m for m in files if each == "sdf" or files[m].suffix == ".urdf"]
         if not models:
             raise ValueError(
-                f"--export {each}: no model of the scene comes from {each.upper()}"
+                f"--export {each}: no model of the scene comes from "
+                + ("URDF" if each == "urdf" else "URDF, SDF or MJCF")
             )
         write = to_urdf if each == "urdf" else to_sdf
         found |= {f"{model}.{each}": write(scene, model) for model in models}
