@@ -177,6 +177,10 @@ class Recording:
         there = ~np.isnan(y)
         return t[there], y[there]
 
+    def episode_at(self, row: int) -> Episode:
+        """The episode that a row is in. Raises: StopIteration for a row in none."""
+        return next(e for e in self.episodes if e.first <= row < e.last)
+
     def held(self, name: str) -> np.ndarray:
         """(n,) a command, held from its row on; NaN before an episode's first one."""
         y = self[name]

@@ -99,9 +99,7 @@ class MujocoProblem(WindowModel, WindowedProblem):
         """The window, less sure of its start where the smoothed motion is farther from
         what was measured there than noise is: something touches or parts."""
         recording = self.recordings[w.recording]
-        episode = next(
-            e for e in recording.episodes if e.first <= w.rows.start < e.last
-        )
+        episode = recording.episode_at(w.rows.start)
         path = self._paths[w.recording, episode.first]
         k = w.rows.start - episode.first
         near = slice(max(k - BESIDE, 0), k + BESIDE + 1)

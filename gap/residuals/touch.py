@@ -358,10 +358,7 @@ class TouchModel:
             starts = np.flatnonzero(np.diff(time, prepend=-np.inf) > 0.5)
             for a, b in zip(starts, [*starts[1:], len(time)], strict=True):
                 score = rms(r[a:b])
-                row = touch.rows[a]
-                (number,) = [
-                    e.number for e in recording.episodes if e.first <= row < e.last
-                ]
+                number = recording.episode_at(touch.rows[a]).number
                 # Samples of one touch err together: they count as one.
                 p.append(float(np.exp(-0.5 * (score / 1.3) ** 2)))
                 found.append(

@@ -590,9 +590,7 @@ class WindowModel(WindowedResidual):
                 out.append(np.zeros((0, len(self.channels))))
                 continue
             recording = self.recordings[w.recording]
-            episode = next(
-                e for e in recording.episodes if e.first <= w.rows.start < e.last
-            )
+            episode = recording.episode_at(w.rows.start)
             y = self.simulation.run(
                 self._initial(w, episode, effects),
                 recording.time[w.rows],
