@@ -534,6 +534,21 @@ def test_a_table_is_aligned_and_says_which_rows_miss_their_target():
         Table("Title", ("a",), [(1,), (2,)], met=(True,))
 
 
+def test_a_table_fits_the_terminal():
+    says = "a sentence that has some more words than fit"
+    table = Table(says, ("what", "n", "why"), [("one", 12345, says)], notes=[says])
+    lines = table.to_text(30).splitlines()
+    assert max(map(len, lines)) <= 30 and len(lines) == 10
+    assert lines[3:8] == [
+        "what      n  why",
+        "----  -----  -----------------",
+        "one   12345  a sentence that",
+        "             has some more",
+        "             words than fit",
+    ]
+    assert table.to_text(200) == table.to_text()
+
+
 @pytest.mark.parametrize(
     ("value", "text", "in_json"),
     [

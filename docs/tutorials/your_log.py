@@ -16,6 +16,7 @@ with ``makebreak`` are what you would type in a terminal.
 # knows of no friction. The "real" arm has 0.3 N m of Coulomb friction in its second
 # joint.
 
+import os
 import shlex
 import subprocess
 import sys
@@ -74,7 +75,8 @@ record("monday.csv", friction=0.3, load=1e-6, seed=1)
 def terminal(command):
     """Runs a command of makebreak, and shows what it prints."""
     words = [sys.executable, "-m", *shlex.split(command)]
-    done = subprocess.run(words, cwd=folder, capture_output=True, text=True)
+    wide = os.environ | {"COLUMNS": "84"}  # As wide as this page.
+    done = subprocess.run(words, cwd=folder, capture_output=True, text=True, env=wide)
     assert done.returncode == 0, done.stderr
     print(done.stdout)
 

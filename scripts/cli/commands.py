@@ -11,7 +11,6 @@ from argparse import Namespace
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from shutil import get_terminal_size
 
 from makebreak.scripts import experiments
 from makebreak.scripts.cli.arguments import (
@@ -34,7 +33,13 @@ from makebreak.scripts.runner.interrupts import CatchInterrupt, interrupts
 from makebreak.scripts.runner.outputs import check_written, default_out
 from makebreak.scripts.runner.parent import end_with_parent
 from makebreak.scripts.runner.settings import apply_settings
-from makebreak.scripts.runner.shown import print_files, show, tell, telling
+from makebreak.scripts.runner.shown import (
+    print_files,
+    show,
+    tell,
+    telling,
+    terminal_width,
+)
 
 # Benchmarks that `reproduce` runs only where they are named.
 _BENCHMARKS = {
@@ -62,7 +67,7 @@ def _list(args) -> int:
         from makebreak.scripts.cli.settings_list import matching_rows, settings_text
 
         config = experiment_module(args.experiment).Config()
-        width = get_terminal_size().columns if sys.stdout.isatty() else None
+        width = terminal_width()
         print(settings_text(args.experiment, config, args.text, width))
         rows = matching_rows(args.experiment, config, args.text)
         tell(
@@ -324,7 +329,7 @@ def _inspect(args) -> int:
     found, files = run_inspect(args.log, robot, out, given)
     tell(**found.to_dict())
     for table in found.tables():
-        print(table.to_text())
+        print(table.to_text(terminal_width()))
     if out is None:
         print("\nProposed sidecar; check it (--out DIR writes it to a file):\n")
         print("\n".join(found.sidecars()), end="")

@@ -12,6 +12,7 @@ from argparse import Namespace
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
+from shutil import get_terminal_size
 from typing import Any, TextIO
 
 from makebreak.scripts.runner.table import Table, json_value
@@ -35,7 +36,13 @@ def say(text: str) -> None:
 def show(table: Table, shown: Table | None = None) -> None:
     """Tells a table. shown: the same as it is better read in a terminal."""
     _facts.setdefault("tables", []).append(table.to_dict())
-    print((shown or table).to_text(), flush=True)
+    print((shown or table).to_text(terminal_width()), flush=True)
+
+
+def terminal_width() -> int | None:
+    """Of the terminal, or as COLUMNS says [characters]; None of a file or a pipe."""
+    known = sys.stdout.isatty() or "COLUMNS" in os.environ
+    return get_terminal_size().columns if known else None
 
 
 def tell(**facts: Any) -> None:

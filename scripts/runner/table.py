@@ -3,12 +3,16 @@
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import zip_longest
+from textwrap import fill, wrap
 
 import numpy as np
 
 # A figure that was not measured, within a text such as "nan mm (nan to nan)"; not the
 # word in a quotation or in a name such as position_nan.
 _NAN = re.compile(r"(?<![\w.\"'])nan(?![\w\"'])")
+
+_NARROW = 16  # Characters of a column that is not made narrower.
 
 
 @dataclass(frozen=True)
@@ -65,24 +69,44 @@ class Table:
                 row.append("" if met is None else "met" if met else "MISSED")
         return heads, rows
 
-    def to_text(self) -> str:
-        """The table in aligned columns, numbers to the right, under its title."""
+    def to_text(self, width: int | None = None) -> str:
+        """The table in aligned columns, numbers to the right, under its title.
+
+        Args: width: of the terminal [characters], to which columns of text are wrapped;
+            None: a line for each row, as for grep.
+        """
         heads, rows = self.cells()
         widths = [max(map(len, col)) for col in zip(heads, *rows, strict=True)]
         right = [
             bool(self.rows) and all(_is_number(row[j]) for row in self.rows)
             for j in range(len(self.columns))
         ] + [False] * (len(heads) - len(self.columns))
+        texts = [j for j, r in enumerate(right) if not r]
+        over = 0 if width is None else sum(widths) + 2 * len(widths) - 2 - width
+        while over > 0 and texts:  # The widest gives way, down to the next one.
+            j = max(texts, key=lambda j: widths[j])
+            if widths[j] <= _NARROW:
+                break
+            widths[j] -= 1
+            over -= 1
 
         def line(cells):
-            pad = [
-                c.rjust(w) if r else c.ljust(w)
-                for c, w, r in zip(cells, widths, right, strict=True)
-            ]
-            return "  ".join(pad).rstrip()
+            parts = [wrap(c, w) or [""] for c, w in zip(cells, widths, strict=True)]
+            lines = []
+            for row in zip_longest(*parts, fillvalue=""):
+                pad = [
+                    c.rjust(w) if r else c.ljust(w)
+                    for c, w, r in zip(row, widths, right, strict=True)
+                ]
+                lines.append("  ".join(pad).rstrip())
+            return "\n".join(lines)
 
         rule = "  ".join("-" * w for w in widths)
-        lines = [self.title, "", line(heads), rule, *map(line, rows), *self.notes]
+        around = [
+            each if width is None else fill(each, width)
+            for each in (self.title, *self.notes)
+        ]
+        lines = [around[0], "", line(heads), rule, *map(line, rows), *around[1:]]
         return "\n".join(lines) + "\n"
 
     def transposed(self) -> "Table":
