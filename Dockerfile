@@ -17,6 +17,8 @@ ENV NUMBA_CPU_NAME=generic PATH=/opt/makebreak/.venv/bin:$PATH
 WORKDIR /opt/makebreak
 COPY . .
 RUN scripts/setup.sh --compile
+# What `gap` compiles at its first run; a container of `docker run --rm` keeps nothing.
+RUN cd "$(mktemp -d)" && python /opt/makebreak/examples/gap_of_an_arm.py
 
 WORKDIR /data
 ENTRYPOINT ["makebreak"]

@@ -46,7 +46,7 @@ from makebreak.diagrams.ball_rolling_config import (
     what_goes_wrong,
     world_scene,
 )
-from makebreak.diagrams.camera import camera_model
+from makebreak.diagrams.camera import CameraConfig, camera_model
 from makebreak.diagrams.faults import faulty_lcs
 from makebreak.diagrams.learned_parameters import (
     add_gap_std,
@@ -104,7 +104,6 @@ from makebreak.systems.contact_mpc.lcs_builder import (
 )
 from makebreak.systems.contact_mpc.numerics.ball_state import N_X, P_BALL
 from makebreak.systems.contact_mpc.parameter_learner import ParameterLearner
-from makebreak.systems.contact_mpc.path_target import PathTargetConfig
 from makebreak.systems.contact_mpc.residual_learner import ResidualLearner
 from makebreak.systems.contact_mpc.rolling_task import RollingTask
 from makebreak.systems.perception.ball_tracker import BallTracker
@@ -131,6 +130,12 @@ OFFSET = dict(
 BALL_CHANNELS = ("ball.ball.x", "ball.ball.y")  # What a camera above sees of it.
 
 
+def noisy_camera(config: BallRollingConfig) -> CameraConfig:
+    """The camera with the noise of ball_noise_m."""
+    noise = replace(config.camera.noise, position_m=config.ball_noise_m)
+    return replace(config.camera, noise=noise)
+
+
 def make_world(
     config: BallRollingConfig,
     meshcat: Meshcat | None = None,
@@ -141,9 +146,9 @@ def make_world(
 
     Args: scene, in place of world_scene(config).
     """
-    if config.camera.position_noise_m != 0.0:
+    if config.camera.noise.position_m != 0.0:
         raise ValueError(
-            f"camera.position_noise_m is {config.camera.position_noise_m}, expected 0: "
+            f"camera.noise.position_m is {config.camera.noise.position_m}, expected 0: "
             "ball_noise_m sets it"
         )
     if not config.ball_noise_m >= 0.0:
@@ -151,7 +156,7 @@ def make_world(
     return make_station(
         StationConfig(
             scene=config.world,
-            camera=replace(config.camera, position_noise_m=config.ball_noise_m),
+            camera=noisy_camera(config),
             contact=[TOOL, "ball"],
             seed=config.seed,
             sampled=sampled,
@@ -356,7 +361,8 @@ def _refuse_unused(config: BallRollingConfig) -> None:
     """Raises: ValueError for settings of parts that the chosen ones replace."""
     plain = BallRollingConfig()
     # Both ways of choosing contacts read the circle.
-    plain.task.center, plain.task.radius = config.task.center, config.task.radius
+    plain.task.circle.center = config.task.circle.center
+    plain.task.circle.radius = config.task.circle.radius
     unused = ["contacts"]
     if config.contact_sequence == "sampled":
         # `contacts` has its own in place of those of the learner.
@@ -429,9 +435,7 @@ def _add_sensing(
                     period_sec=TRACK,
                     offset_sec=OFFSET["tracker"],
                 ),
-                camera_model(
-                    replace(config.camera, position_noise_m=config.ball_noise_m)
-                ),
+                camera_model(noisy_camera(config)),
             ),
         )
         builder.Connect(
@@ -591,7 +595,7 @@ def _add_cycle(rig: _Rig, learned: _Learned, follow_hard: bool) -> _Touches:
         "rolling_task",
         RollingTask(
             replace(config.task, period_sec=CONTROL, offset_sec=OFFSET["task"]),
-            n_knots=config.planner.N + 1,
+            n_knots=config.planner.options.N + 1,
             knot_sec=PLAN_DT,
             radius_ball=model.ball_radius,
             radius_tip=model.tip_radius,
@@ -624,7 +628,7 @@ def _add_sampled(rig: _Rig, learned: _Learned, gap: OutputPort) -> _Touches:
     added = add_sampled_contacts(
         rig.builder,
         contacts,
-        PathTargetConfig(center=config.task.center, radius=config.task.radius),
+        config.task.circle,
         rig.model,
         rig.lcs_of["plan"],
         c3,
@@ -712,8 +716,8 @@ def _add_view(rig: _Rig, meshcat: Meshcat, gap: OutputPort, task: LeafSystem) ->
         "rolling_view",
         RollingView(
             RollingViewConfig(
-                center=rig.config.task.center,
-                radius=rig.config.task.radius,
+                center=rig.config.task.circle.center,
+                radius=rig.config.task.circle.radius,
                 ball_radius=rig.model.ball_radius,
             ),
             meshcat,

@@ -56,9 +56,10 @@ BALL_RESISTANCE = 0.005  # Lever arm over radius.
 class PlannerConfig:
     """The costs of C3+ and its ADMM weights (docs/c3.md), for forces in newtons."""
 
-    N: int = 5  # Number of knots of the plan, 0.1 s (PLAN_DT) apart.
-    rounds: int = 4  # Number of ADMM rounds.
-    rho: float = 2.2  # Factor by which the consensus weights grow from round to round.
+    # Knots of the plan are 0.1 s (PLAN_DT) apart.
+    options: C3Options = field(
+        default_factory=lambda: C3Options(N=5, rounds=4, rho=2.2)
+    )
     tip: float = 500.0  # Weight of the tip's position; its velocity gets 1/50 of it.
     ball: float = 5000.0  # Weight of the ball's position on the table.
     ball_velocity: float = 300.0  # Weight of the ball's velocity and angular velocity.
@@ -69,7 +70,6 @@ class PlannerConfig:
     # Whether sliding contacts do not open in the one-step model of the command
     # (C3Config).
     sliding_command: bool = True
-    polish: int = 0  # Number of rollouts that improve the plan (docs/c3.md); 0: none.
 
 
 @dataclass
@@ -152,7 +152,7 @@ class BallRollingConfig:
     # ball, its own for a fruit.
     rolling_resistance: float | None = None
     # Standard deviation of the random shift of each image, as a length at
-    # camera.noise_height [m].
+    # camera.noise.height [m].
     ball_noise_m: float = 0.001
     # Angle on the circle at which the ball starts [rad]; null: drawn by the seed.
     start_angle_rad: float | None = None
@@ -213,10 +213,10 @@ def what_goes_wrong(config: BallRollingConfig) -> StationFaults | None:
         return None
     faults = read_faults(config.faults, ("camera", "ball", "planner", "scene"))
     angle, task = start_angle(config) + BOX_AHEAD, config.task
-    x, y = np.array(task.center) + task.radius * np.array(
+    x, y = np.array(task.circle.center) + task.circle.radius * np.array(
         [np.cos(angle), np.sin(angle)]
     )
-    return StationFaults(faults, (float(x), float(y), 0.03), center=task.center)
+    return StationFaults(faults, (float(x), float(y), 0.03), center=task.circle.center)
 
 
 def world_scene(config: BallRollingConfig) -> Scene:
@@ -226,7 +226,7 @@ def world_scene(config: BallRollingConfig) -> Scene:
     if config.object != "ball":
         _replace_ball(scene, config)
     angle = start_angle(config)
-    center, radius = np.array(config.task.center), config.task.radius
+    center, radius = np.array(config.task.circle.center), config.task.circle.radius
     xy = center + radius * np.array([np.cos(angle), np.sin(angle)])
     z = scene.initial.poses["ball.ball"][6]
     turned = [1.0, 0.0, 0.0, 0.0]
@@ -314,12 +314,7 @@ def c3_config(planner: PlannerConfig, n_lam: int, projection: str = "plus") -> C
     return C3Config(
         weights=C3Weights(Q, np.full(3, 0.01), G, G),
         projection=PROJECTIONS[projection](),
-        options=C3Options(
-            N=planner.N,
-            rounds=planner.rounds,
-            rho=planner.rho,
-            polish=planner.polish,
-        ),
+        options=planner.options,
         residual_dt_sec=LEARN,
         sliding_command=planner.sliding_command,
     )

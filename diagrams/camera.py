@@ -48,6 +48,17 @@ engine.RenderColorImage(ColorRenderCamera(core, False), ImageRgba8U(8, 8))
 
 
 @dataclass
+class CameraNoise:
+    """A random shift of each image, as a whole."""
+
+    # Standard deviation of each image's random shift along u and v, as a length at
+    # noise.height [m]; in ball_rolling ball_noise_m sets it.
+    position_m: float = 0.0
+    # Height above the world's z = 0 at which noise.position_m is measured [m].
+    height: float = 0.0315
+
+
+@dataclass
 class CameraConfig:
     """The overhead camera: image, place, renderer, noise."""
 
@@ -59,11 +70,7 @@ class CameraConfig:
     position: list[float] = field(default_factory=lambda: [0.5, 0.0, 0.8])
     # Renderer of the images: vtk, drawn, or auto: vtk where it works, else drawn.
     renderer: str = "auto"
-    # Standard deviation of each image's random shift along u and v, as a length at
-    # noise_height [m]; in ball_rolling ball_noise_m sets it.
-    position_noise_m: float = 0.0
-    # Height above the world's z = 0 at which position_noise_m is measured [m].
-    noise_height: float = 0.0315
+    noise: CameraNoise = field(default_factory=CameraNoise)
     # Period of the images, each with a random shift of its own [s]; fixed in
     # ball_rolling.
     period_sec: float = 0.0125
@@ -128,17 +135,17 @@ def add_camera(
     Returns: the abstract ImageRgba8U port; an image is rendered when it is evaluated.
     Raises: ValueError for a setting out of range.
     """
-    if not config.position_noise_m >= 0.0:
+    if not config.noise.position_m >= 0.0:
         raise ValueError(
-            f"position_noise_m must be at least 0, got {config.position_noise_m}"
+            f"noise.position_m must be at least 0, got {config.noise.position_m}"
         )
     if len(config.position) != 3 or not np.isfinite(config.position).all():
         raise ValueError(f"camera position must be 3 numbers, got {config.position}")
-    depth = config.position[2] - config.noise_height
+    depth = config.position[2] - config.noise.height
     if not depth > 0.0:
         raise ValueError(
-            f"the camera at height {config.position[2]} must be above noise_height, "
-            f"{config.noise_height}"
+            f"the camera at height {config.position[2]} must be above noise.height, "
+            f"{config.noise.height}"
         )
     camera = camera_model(config)
     if resolve_renderer(config) == "vtk":
@@ -151,9 +158,9 @@ def add_camera(
             plant.get_body_poses_output_port(), drawn.GetInputPort("body_poses")
         )
         port = drawn.GetOutputPort("rgb_image")
-    if config.position_noise_m == 0.0:
+    if config.noise.position_m == 0.0:
         return port
-    shift_std_px = config.position_noise_m * camera.focal / depth
+    shift_std_px = config.noise.position_m * camera.focal / depth
     shake = builder.AddNamedSystem(
         f"{name}_shake",
         CameraShake(config.width, config.height, shift_std_px, seed, config.period_sec),

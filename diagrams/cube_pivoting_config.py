@@ -3,6 +3,7 @@ the planner's model, their scenes, the start, contact pairs and C3's weights."""
 
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from operator import attrgetter
 from typing import Literal
 
 import numpy as np
@@ -56,6 +57,18 @@ class PivotStart:
 
 
 @dataclass
+class PivotModel:
+    """What is wrong in the planner's model of the cube."""
+
+    # Friction in the planner's model over that in the world.
+    friction_error: float = 1.0
+    # Mass of the cube in the planner's model over that in the world.
+    mass_error: float = 1.0
+    # Size of the cube in the planner's model over that in the world.
+    size_error: float = 1.0
+
+
+@dataclass
 class PivotPlanner:
     """Settings of cube_pivoting's planner."""
 
@@ -101,12 +114,7 @@ class CubePivotingConfig:
     start: PivotStart = field(default_factory=PivotStart)
     mass: float = 0.4  # Mass of the cube in the world [kg].
     size: float = 1.0  # Size of the cube in the world over that in the scene file.
-    # Friction in the planner's model over that in the world.
-    friction_error: float = 1.0
-    # Mass of the cube in the planner's model over that in the world.
-    mass_error: float = 1.0
-    # Size of the cube in the planner's model over that in the world.
-    size_error: float = 1.0
+    model: PivotModel = field(default_factory=PivotModel)
     planner: PivotPlanner = field(default_factory=PivotPlanner)
     adapt: bool = False  # Whether the contacts' residuals are learned.
     learning: ResidualLearnerConfig = field(default_factory=_learner)
@@ -127,9 +135,11 @@ def world_cube(config: CubePivotingConfig) -> Cube:
     """The simulated cube in the run of config.seed. Raises: ValueError."""
     c = config
     friction = _range("start.friction", c.start.friction, 0.0)
-    for name in ("mass", "size", "friction_error", "mass_error", "size_error"):
-        if not 0.0 < getattr(c, name) < np.inf:
-            raise ValueError(f"{name} is {getattr(c, name)}, expected > 0")
+    for name in (
+        "mass", "size", "model.friction_error", "model.mass_error", "model.size_error",
+    ):  # fmt: skip
+        if not 0.0 < (value := attrgetter(name)(c)) < np.inf:
+            raise ValueError(f"{name} is {value}, expected > 0")
     drawn = np.random.default_rng([c.seed, 1]).uniform(friction[0], friction[1])
     return Cube(float(drawn), c.mass, c.size * _side(c.world))
 
@@ -138,9 +148,9 @@ def model_cube(config: CubePivotingConfig) -> Cube:
     """The cube of the planner's model in the same run."""
     c, cube = config, world_cube(config)
     return Cube(
-        cube.friction * c.friction_error,
-        cube.mass * c.mass_error,
-        cube.side * c.size_error,
+        cube.friction * c.model.friction_error,
+        cube.mass * c.model.mass_error,
+        cube.side * c.model.size_error,
     )
 
 

@@ -409,7 +409,7 @@ def _add_touch(builder, config: GentleRollingConfig, ball: BallRollingConfig) ->
     model, scene = controller_model(ball)
     arm = make_control_plant(scene)
     chain = serial_chain_of(arm, TIP_FRAME)
-    path = CirclePath(np.array(ball.task.center), ball.task.radius)
+    path = CirclePath(np.array(ball.task.circle.center), ball.task.circle.radius)
 
     def add(name: str, system: LeafSystem):
         return builder.AddNamedSystem(name, system)

@@ -31,7 +31,11 @@ from makebreak.systems.planar.planar_impedance import (
     PlanarImpedance,
     PlanarImpedanceConfig,
 )
-from makebreak.systems.planar.planar_world import CircleTargetConfig, PlanarWorldConfig
+from makebreak.systems.planar.planar_world import (
+    CircleTargetConfig,
+    PlanarWorldConfig,
+    SpringConfig,
+)
 
 SPRINGS = "springs"  # The setting of the paper: only the force sensor has noise.
 # Largest length at which springs of the setting "engaging" pull [m]; the circle is 0.5
@@ -131,18 +135,16 @@ def draw_springs(
     anchors = distance[:, None] * np.column_stack(
         [np.cos(DIRECTIONS), np.sin(DIRECTIONS)]
     )
-    reach = None
+    reach = np.full(3, np.inf)
     if engaging:
-        reach = (REACH * (1.0 + spread * rng.uniform(-1.0, 1.0, 3))).tolist()
-    world = PlanarWorldConfig(
-        mass=MASS,
-        anchors=anchors.tolist(),
-        stiffness=stiffness.tolist(),
-        rest_length=3 * [REST_LENGTH],
-        reach=reach,
-        period_sec=PERIOD,
-    )
-    return world, target
+        reach = REACH * (1.0 + spread * rng.uniform(-1.0, 1.0, 3))
+    springs = [
+        SpringConfig(anchor, k, REST_LENGTH, most)
+        for anchor, k, most in zip(
+            anchors.tolist(), stiffness.tolist(), reach.tolist(), strict=True
+        )
+    ]
+    return PlanarWorldConfig(MASS, springs=springs, period_sec=PERIOD), target
 
 
 def make_multi_spring(

@@ -127,8 +127,8 @@ def make_planar(
             "view",
             PlanarView(
                 PlanarViewConfig(
-                    anchors=world.anchors,
-                    stiffness=world.stiffness,
+                    anchors=[spring.anchor for spring in world.springs],
+                    stiffness=[spring.stiffness for spring in world.springs],
                     viscosity=world.viscosity,
                     ramp_sec=target.duration_sec,
                 ),

@@ -157,7 +157,7 @@ def make_push_object(
     Raises: ValueError for a setting out of range or one that this diagram computes.
     """
     check_own(config, SET_BY_DIAGRAM)
-    refuse_changed("sampler.sampling", config.sampler.sampling, ("wrist",))
+    refuse_changed("sampler.sampling.reach", config.sampler.sampling.reach, ("wrist",))
     _refuse_unused(config)
     builder = DiagramBuilder()
     model = _make_model(config)
@@ -412,7 +412,9 @@ def _add_planning(
     )
     # A rolling object carries the place where it will be touched along with it.
     follow = config.sampler.sampling.follow or model.rolls
-    sampling = replace(config.sampler.sampling, follow=follow, wrist=model.wrist)
+    sampling = config.sampler.sampling
+    reach = replace(sampling.reach, wrist=model.wrist)
+    sampling = replace(sampling, follow=follow, reach=reach)
     radius = model.tip.tip_radius
     if not radius < sampling.height < model.top:
         raise ValueError(
@@ -432,7 +434,7 @@ def _add_planning(
                 period_sec=CONTROL,
                 offset_sec=OFFSET["task"],
             ),
-            config.planner.N + 1,
+            config.planner.options.N + 1,
             model.shape,
             model.p_tip,
         ),
@@ -472,7 +474,7 @@ def _add_arm_control(
             replace(
                 config.reference,
                 height=sampling.height,
-                nearest=max(sampling.reach[0] - sampling.inwards, 0.0),
+                nearest=max(sampling.reach.range[0] - sampling.reach.inwards, 0.0),
                 wrist=model.wrist,
                 period_sec=CONTROL,
                 offset_sec=OFFSET["reference"],

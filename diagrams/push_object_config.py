@@ -35,7 +35,10 @@ from makebreak.systems.contact_mpc.numerics.c3_mpc import (
     C3Weights,
     OrientationWeight,
 )
-from makebreak.systems.contact_mpc.numerics.contact_sampling import SamplingConfig
+from makebreak.systems.contact_mpc.numerics.contact_sampling import (
+    ReachConfig,
+    SamplingConfig,
+)
 from makebreak.systems.contact_mpc.parameter_learner import ParameterLearnerConfig
 from makebreak.systems.contact_mpc.push_goals import PushGoalsConfig
 from makebreak.systems.contact_mpc.push_task import PushTaskConfig
@@ -83,9 +86,10 @@ SET_BY_DIAGRAM = {
 class PushPlannerConfig:
     """Horizon and cost of C3+; forces in newtons."""
 
-    N: int = 5  # Number of knots of the plan, 0.1 s (PLAN_DT) apart.
-    rounds: int = 2  # Number of ADMM rounds.
-    polish: int = 6  # Number of rollouts that improve the plan (docs/c3.md); 0: none.
+    # Knots of the plan are 0.1 s (PLAN_DT) apart.
+    options: C3Options = field(
+        default_factory=lambda: C3Options(N=5, rounds=2, rho=2.2, polish=6)
+    )
     position: float = 5000.0  # Weight of the object's position on the table [1/m2].
     # Radius at which an angle of the object costs as much as its arc as a distance [m].
     angle_radius: float = 0.12
@@ -198,7 +202,9 @@ class PushObjectConfig:
     camera: CameraConfig = field(default_factory=CameraConfig)
     tracker: PoseTrackerConfig = field(default_factory=PoseTrackerConfig)
     sampler: ContactSamplerConfig = field(
-        default_factory=lambda: ContactSamplerConfig(SamplingConfig(reach=[0.32, 0.78]))
+        default_factory=lambda: ContactSamplerConfig(
+            SamplingConfig(reach=ReachConfig([0.32, 0.78]))
+        )
     )
     task: PushTaskConfig = field(default_factory=PushTaskConfig)
     planner: PushPlannerConfig = field(default_factory=PushPlannerConfig)
@@ -275,7 +281,7 @@ def c3_config(
                 )
             ],
         ),
-        options=C3Options(N=p.N, rounds=p.rounds, rho=2.2, polish=p.polish),
+        options=p.options,
         residual_dt_sec=LEARN,
         sliding_command=True,
     )  # fmt: skip

@@ -39,7 +39,9 @@ from makebreak.systems.contact_mpc.numerics.c3_mpc import (
     C3Weights,
 )
 from makebreak.systems.contact_mpc.numerics.contact_sampling import (
+    ChangeConfig,
     ObjectShape,
+    ReachConfig,
     SamplingConfig,
 )
 from makebreak.systems.contact_mpc.numerics.push_task import (
@@ -47,6 +49,7 @@ from makebreak.systems.contact_mpc.numerics.push_task import (
     TravelConfig,
     UnseenConfig,
 )
+from makebreak.systems.contact_mpc.numerics.rolling_task import CircleConfig
 from makebreak.systems.contact_mpc.path_target import PathTarget, PathTargetConfig
 from makebreak.systems.contact_mpc.push_task import PushTask, PushTaskConfig
 
@@ -57,9 +60,10 @@ CORNERS = 24  # Of the polygon inscribed in the ball's outline; error below 0.3 
 class SampledPlannerConfig:
     """Weights of C3+, with forces in newtons."""
 
-    N: int = 5  # Number of knots of the plan, 0.1 s apart.
-    rounds: int = 2  # Number of ADMM rounds.
-    polish: int = 6  # Number of rollouts that improve the plan (docs/c3.md); 0: none.
+    # Knots of the plan are 0.1 s apart.
+    options: C3Options = field(
+        default_factory=lambda: C3Options(N=5, rounds=2, rho=2.2, polish=6)
+    )
     position: float = 5000.0  # Q of the ball's x and y [1/m2].
     # Q of the ball's velocity v, and of w R with its angular velocity w [s2/m2].
     velocity: float = 100.0
@@ -84,13 +88,10 @@ class SampledContactsConfig:
         default_factory=lambda: ContactSamplerConfig(
             SamplingConfig(
                 height=0.038,
-                reach=[0.35, 0.78],
-                out_of_reach=0.0,
-                travel=5.0,
-                hysteresis=[0.3, 1.0],
+                reach=ReachConfig([0.35, 0.78], cost=0.0),
+                change=ChangeConfig(travel=5.0, hysteresis=[0.3, 1.0], keep_sec=0.5),
                 push=0.5,
                 follow=True,
-                keep_sec=0.5,
             )
         )
     )
@@ -149,8 +150,9 @@ def check_contacts(config: SampledContactsConfig) -> None:
         )
     refuse_changed(
         "contacts.path", config.path,
-        ("center", "radius", "height", "period_sec", "offset_sec"),
+        ("height", "period_sec", "offset_sec"),
     )  # fmt: skip
+    refuse_changed("contacts.path.circle", config.path.circle, ("center", "radius"))
     refuse_changed(
         "contacts.sampler", config.sampler,
         ("angle_radius", "residual_dt_sec", "offset_sec"),
@@ -202,7 +204,7 @@ def sampled_c3_config(
     G = plus_weights(p.force, n_lam, n_tip)
     return C3Config(
         weights=C3Weights(Q, np.full(3, 0.01), G, G),
-        options=C3Options(N=p.N, rounds=p.rounds, rho=2.2, polish=p.polish),
+        options=p.options,
         residual_dt_sec=residual_dt,
         sliding_command=True,
     )
@@ -220,7 +222,7 @@ class SampledContacts:
 def add_sampled_contacts(
     builder: DiagramBuilder,
     config: SampledContactsConfig,
-    path: PathTargetConfig,
+    circle: CircleConfig,
     model: TipAndBall,
     lcs: AnitescuLcs,
     c3: C3Config,
@@ -232,7 +234,7 @@ def add_sampled_contacts(
 ) -> SampledContacts:
     """Adds and connects them, except for r_comp and the inputs of C3 and the arm.
 
-    Args: path: centre and radius of the circle; lcs: that of C3; p_tip (3,): initial
+    Args: circle: its centre and radius; lcs: that of C3; p_tip (3,): initial
         position of the tip [m]; n_tip: number of forces of tip and ball; period: of the
         task [s]; offset: {"target", "task", "sampler": first update [s]}.
     """
@@ -242,7 +244,10 @@ def add_sampled_contacts(
         "path_target",
         PathTarget(
             replace(
-                config.path, center=path.center, radius=path.radius,
+                config.path,
+                circle=replace(
+                    config.path.circle, center=circle.center, radius=circle.radius
+                ),
                 height=sampling.height, period_sec=period, offset_sec=offset["target"],
             ),
             c3.options.N + 1,

@@ -15,7 +15,11 @@ from makebreak.systems.baselines.numerics.biomimetic import (
     force_command,
     no_gains,
 )
-from makebreak.systems.planar.planar_world import CircleTargetConfig, PlanarWorldConfig
+from makebreak.systems.planar.planar_world import (
+    CircleTargetConfig,
+    PlanarWorldConfig,
+    SpringConfig,
+)
 
 PERFECT = PlanarSensing(force_noise=0.0)
 
@@ -73,9 +77,7 @@ def test_command_is_the_sum_of_its_terms():
 def test_learns_a_constant_force_over_trials():
     """12 N from the side, by a spring so long and soft that it is constant. At each
     time step F -> 12 N, and the error with it; nothing is forgotten."""
-    world = PlanarWorldConfig(
-        anchors=[[1e4, 0.0]], stiffness=[1.2e-3], rest_length=[0.0]
-    )
+    world = PlanarWorldConfig(springs=[SpringConfig([1e4, 0.0], 1.2e-3, 0.0)])
     config = BiomimeticConfig(rates=[8.0, 0.0, 0.0], forget=0.0)
     known, curve = None, []
     for _ in range(25):

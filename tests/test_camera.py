@@ -13,6 +13,7 @@ from scipy import ndimage
 
 from makebreak.diagrams.camera import (
     CameraConfig,
+    CameraNoise,
     add_camera,
     camera_model,
     describe_camera,
@@ -237,7 +238,7 @@ def test_a_shifted_picture_is_linear_between_pixels_and_ends_as_its_edges(shape)
 
 
 def test_shaken_pictures_move_by_the_frame_shift():
-    config = CameraConfig(renderer="drawn", position_noise_m=0.002)
+    config = CameraConfig(renderer="drawn", noise=CameraNoise(0.002))
     still = Studio(CameraConfig(renderer="drawn"), [(Sphere(RADIUS), ORANGE)])
     shaken = Studio(config, [(Sphere(RADIUS), ORANGE)], seed=3)
     p = [0.55, 0.05, RADIUS]
@@ -251,7 +252,7 @@ def test_shaken_pictures_move_by_the_frame_shift():
 
 
 def test_a_frame_is_shaken_the_same_whenever_it_is_asked_for():
-    config = CameraConfig(renderer="drawn", position_noise_m=0.002)
+    config = CameraConfig(renderer="drawn", noise=CameraNoise(0.002))
     p, time = [0.55, 0.05, RADIUS], 13 * config.period_sec
     first, again, other = (
         Studio(config, [(Sphere(RADIUS), ORANGE)], seed) for seed in (3, 3, 4)
@@ -286,12 +287,15 @@ def test_the_renderer_in_use_can_be_asked_for(renderer):
     "change, message",
     [
         (dict(renderer="opengl"), "camera.renderer is 'opengl', expected auto, vtk"),
-        (dict(position_noise_m=-1.0), "position_noise_m must be at least 0, got -1.0"),
-        (dict(position=[0.5, 0.0, 0.01]), "height 0.01 must be above noise_height"),
+        (
+            dict(noise=CameraNoise(-1.0)),
+            "noise.position_m must be at least 0, got -1.0",
+        ),
+        (dict(position=[0.5, 0.0, 0.01]), "height 0.01 must be above noise.height"),
         (dict(position=[0.5, 0.0]), "position must be 3 numbers"),
         (dict(fov_y=4.0), "fov_y must be between 0 and pi, got 4.0"),
         (dict(width=0), "width, height and focal length must be positive, got 0"),
-        (dict(period_sec=0.0, position_noise_m=1e-3), "period_sec positive, got"),
+        (dict(period_sec=0.0, noise=CameraNoise(1e-3)), "period_sec positive, got"),
     ],
 )
 def test_a_camera_that_cannot_be_is_refused_by_name(change, message):

@@ -278,6 +278,15 @@ def test_an_unknown_key_is_a_short_line_that_begins_with_what_is_near(name):
     ("old", "new"),
     [
         ("task.rolling.roll_sec", "task.rolling.roll.sec"),
+        ("task.radius", "task.circle.radius"),
+        ("contacts.path.speed", "contacts.path.circle.speed"),
+        ("planner.N", "planner.options.N"),
+        ("impedance.posture_damping", "impedance.posture.damping"),
+        ("camera.noise_height", "camera.noise.height"),
+        (
+            "contacts.sampler.sampling.keep_sec",
+            "contacts.sampler.sampling.change.keep_sec",
+        ),
         ("task.rolling.withdraw_speed", "task.rolling.unseen.withdraw_speed"),
         ("contacts.push.unseen_sec", "contacts.push.unseen.sec"),
         ("contacts.push.room", "contacts.push.travel.room"),
@@ -305,7 +314,7 @@ def test_infinity_is_accepted_where_it_means_that_there_is_no_limit():
         before = reduce(getattr, key.split("."), apply_settings(config, [f"{key}=0.5"]))
         after = reduce(getattr, key.split("."), apply_settings(config, [f"{key}=inf"]))
         assert (before, after) == (0.5, np.inf)
-    for key in ("reference.limits.speed_max", "impedance.posture_damping", "friction"):
+    for key in ("reference.limits.speed_max", "impedance.posture.damping", "friction"):
         with pytest.raises(ValueError, match=f'{key}: got ".inf", expected a number'):
             apply_settings(config, [f"{key}=inf"])
     with pytest.raises(ValueError, match="expected a number"):

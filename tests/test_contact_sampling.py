@@ -42,7 +42,9 @@ from makebreak.systems.contact_mpc.numerics.c3_mpc import (
 )
 from makebreak.systems.contact_mpc.numerics.c3_plan import WarmStart
 from makebreak.systems.contact_mpc.numerics.contact_sampling import (
+    ChangeConfig,
     ObjectShape,
+    ReachConfig,
     SamplingConfig,
     SamplingMemory,
     choose,
@@ -532,7 +534,10 @@ def test_a_plan_that_leads_the_tip_out_of_reach_costs_more(planner):
 
     def cost(price):
         _, found = sample_round(
-            SamplingConfig(out_of_reach=price, hysteresis=[0.0, 1e6]), SamplingMemory(),
+            SamplingConfig(
+                reach=ReachConfig(cost=price),
+                change=ChangeConfig(hysteresis=[0.0, 1e6]),
+            ), SamplingMemory(),
             model.build_many, problem, shape, x, x_desired, 0.1, True, 0.0,
         )  # fmt: skip
         assert found.chosen == 0
@@ -553,7 +558,8 @@ def test_the_way_through_the_air_has_its_price_but_not_for_a_tip_that_pushes(pla
 
     def cost(travel, in_contact):
         memory, found = sample_round(
-            SamplingConfig(travel=travel), SamplingMemory(), model.build_many, problem,
+            SamplingConfig(change=ChangeConfig(travel)), SamplingMemory(),
+            model.build_many, problem,
             shape, x, x_desired, 0.1, in_contact, 0.0,
         )  # fmt: skip
         return found
@@ -999,11 +1005,11 @@ def test_a_context_replays_the_same_choices(planner):
     [
         ({"places": 0}, "sampling.places is 0"),
         ({"clearance": 0.0}, "sampling.clearance is 0.0"),
-        ({"travel": -1.0}, "sampling.travel is -1.0"),
-        ({"hysteresis": [1.0, 0.0]}, "sampling.hysteresis"),
-        ({"reach": [0.5, 0.4]}, "sampling.reach"),
-        ({"out_of_reach": -1.0}, "sampling.out_of_reach is -1.0"),
-        ({"inwards": -0.1}, "sampling.inwards is -0.1"),
+        ({"change": ChangeConfig(-1.0)}, "sampling.change.travel is -1.0"),
+        ({"change": ChangeConfig(hysteresis=[1.0, 0.0])}, "sampling.change.hysteresis"),
+        ({"reach": ReachConfig([0.5, 0.4])}, "sampling.reach.range"),
+        ({"reach": ReachConfig(cost=-1.0)}, "sampling.reach.cost is -1.0"),
+        ({"reach": ReachConfig(inwards=-0.1)}, "sampling.reach.inwards is -0.1"),
     ],
 )
 def test_a_setting_out_of_range_is_named(planner, change, message):

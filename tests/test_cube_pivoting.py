@@ -21,6 +21,7 @@ from makebreak.diagrams.cube_pivoting_config import (
     SCENE,
     Cube,
     CubePivotingConfig,
+    PivotModel,
     PivotPlanner,
     PivotStart,
     contact_pairs,
@@ -155,7 +156,9 @@ def test_a_cube_is_pivoted_gently():
 @pytest.mark.parametrize("size_error", [0.9, 1.1])
 def test_the_learner_finds_how_much_too_near_or_far_the_faces_are(size_error):
     """Each is wrong by half the error of the side, 5 mm."""
-    config = CubePivotingConfig(seed=0, size_error=size_error, adapt=True)
+    config = CubePivotingConfig(
+        seed=0, model=PivotModel(size_error=size_error), adapt=True
+    )
     diagram, context = simulated(config, 1.0)
     gap = config.planner.period_sec * diagram.GetOutputPort("r_comp").Eval(context)
     _, force = logged_forces(diagram, context)
@@ -169,7 +172,7 @@ def test_the_learner_finds_how_much_too_near_or_far_the_faces_are(size_error):
 
 
 def test_a_cube_modelled_too_small_is_tipped_sooner_with_the_learner():
-    config = CubePivotingConfig(seed=3, size_error=0.9)
+    config = CubePivotingConfig(seed=3, model=PivotModel(size_error=0.9))
     angles = []
     for adapt in (False, True):
         diagram, context = simulated(replace(config, adapt=adapt), 3.0)
@@ -178,7 +181,9 @@ def test_a_cube_modelled_too_small_is_tipped_sooner_with_the_learner():
 
 
 def test_without_adaptation_there_is_no_residual():
-    diagram, context = simulated(CubePivotingConfig(size_error=0.9), 0.2)
+    diagram, context = simulated(
+        CubePivotingConfig(model=PivotModel(size_error=0.9)), 0.2
+    )
     assert (diagram.GetOutputPort("r_comp").Eval(context) == 0.0).all()
 
 
@@ -244,7 +249,7 @@ def test_seed_draws_the_start_and_the_friction_within_their_ranges():
 def test_world_and_model_differ_by_the_errors_alone():
     config = CubePivotingConfig(mass=0.5, size=0.8)
     assert world_cube(config) == model_cube(config)
-    wrong = replace(config, friction_error=0.5, mass_error=2.0, size_error=1.1)
+    wrong = replace(config, model=PivotModel(0.5, 2.0, 1.1))
     world, model = world_cube(wrong), model_cube(wrong)
     assert world == world_cube(config)
     assert (world.mass, world.side) == (0.5, pytest.approx(0.08))
@@ -259,7 +264,7 @@ def test_world_and_model_differ_by_the_errors_alone():
     "words, message",
     [
         ("mass=-1", "mass is -1.0, expected > 0"),
-        ("size_error=0", "size_error is 0.0, expected > 0"),
+        ("model.size_error=0", "model.size_error is 0.0, expected > 0"),
         ("start.friction=[0.5]", "start.friction is [0.5], expected [low, high]"),
         ("start.friction=[1,0.5]", "start.friction is [1.0, 0.5], expected"),
         ("start.height=[0.1,0.05]", "start.height is [0.1, 0.05], expected"),
@@ -378,7 +383,13 @@ def test_meshcat_shows_cube_and_fingers():
 
 def test_command_line_writes_result_recording_and_model(tmp_path, capsys):
     out = tmp_path / "a"
-    words = ["--set", "planner.rate=1.5", "size=0.9", "mass_error=1.1", "adapt=true"]
+    words = [
+        "--set",
+        "planner.rate=1.5",
+        "size=0.9",
+        "model.mass_error=1.1",
+        "adapt=true",
+    ]
     arguments = ["run", "cube_pivoting", "--no-meshcat", "--seed", "3", *words]
     assert main([*arguments, "--out", str(out), "--duration", "3"]) == 0
     result = json.loads((out / "result.json").read_text())

@@ -199,7 +199,7 @@ def test_the_page_stands_alone_and_says_it_first(case, tmp_path):
     assert "Next best: joint_viscous_damping at p.j1, error 62 % larger." in first
     assert "It lags 4 ms." in text and "1 note Noise" in text
     assert f"makebreak gap {tmp_path / 'scene.yaml'} {case[1]}" in text
-    assert "--export urdf,mjcf" in text
+    assert "--export urdf,sdf,mjcf" in text
     # Only the model of a run is one that an experiment can be run with.
     assert "makebreak run" not in text
     write_report(

@@ -481,7 +481,7 @@ def test_felt_begins_at_the_seam_and_the_models_have_none():
     assert zone.y[0] == SEAM_Y and zone.x[0] < 0.0 < 0.7 < zone.x[1]
     assert not controller_model(ball)[1].friction_zones
     # The seam is on the ball's way.
-    assert abs(SEAM_Y - ball.task.center[1]) < ball.task.radius
+    assert abs(SEAM_Y - ball.task.circle.center[1]) < ball.task.circle.radius
     # The ball starts so that after one push the way ahead leads to the wrist's side.
     assert START_ANGLE[0] <= ball.start_angle_rad <= START_ANGLE[1]
     given = on_two_surfaces(config(table="felt_and_glass"))
@@ -504,8 +504,8 @@ def test_a_run_ends_by_the_circles_that_are_scored():
     ending = experiment._Ending(ball, plant)
     angle = np.arange(0.0, 10.0 * np.pi, 0.05)
     cut = abs(angle - 7.0 * np.pi) < np.pi / 3.0
-    radius = np.where(cut, 0.04, ball.task.radius)
-    p = np.array([*ball.task.center, 0.0])
+    radius = np.where(cut, 0.04, ball.task.circle.radius)
+    p = np.array([*ball.task.circle.center, 0.0])
     p = p + np.column_stack([radius * np.cos(angle), radius * np.sin(angle), 0 * angle])
     at = plant.GetBodyByName("ball").floating_positions_start() + 4
     sample = {"state": np.zeros(plant.num_multibody_states())}
@@ -513,7 +513,7 @@ def test_a_run_ends_by_the_circles_that_are_scored():
         sample["state"][at : at + 3] = p[k]
         if ending(0.2 * k, sample):
             break
-    scored = progress_of(p[: k + 1], ball.task.center, ball.task.radius)
+    scored = progress_of(p[: k + 1], ball.task.circle.center, ball.task.circle.radius)
     assert scored[-1] == pytest.approx(8.0 * np.pi, abs=0.05)
     assert angle[k] == pytest.approx(8.0 * np.pi + 2.0 * np.pi / 3.0, abs=0.15)
 

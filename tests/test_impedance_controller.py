@@ -27,6 +27,7 @@ from makebreak.systems.arm.impedance_controller import (
     DELAY_DAMPING_MAX,
     ImpedanceConfig,
     ImpedanceController,
+    PostureConfig,
     serial_chain_of,
 )
 from makebreak.systems.arm.numerics.energy_tank import N_TANK
@@ -668,7 +669,7 @@ def test_a_tip_that_no_joint_moves_is_no_error(control_orientation):
         ({"stiffness": [1.0] * 5}, "stiffness is .* expected 6 numbers"),
         ({"damping": [-1.0] * 6}, "damping is .* expected 6 numbers"),
         ({"stiffness": [np.nan] * 6}, r"stiffness\[0\] is nan, expected a number"),
-        ({"posture_stiffness": -1.0}, "posture_stiffness is -1.0"),
+        ({"posture": PostureConfig(-1.0)}, "posture.stiffness is -1.0"),
         ({"period_sec": 0.0}, "period_sec is 0.0, expected a positive time"),
     ],
 )

@@ -39,7 +39,11 @@ from makebreak.systems.planar.planar_impedance import (
     PlanarImpedance,
     PlanarImpedanceConfig,
 )
-from makebreak.systems.planar.planar_world import CircleTargetConfig, PlanarWorldConfig
+from makebreak.systems.planar.planar_world import (
+    CircleTargetConfig,
+    PlanarWorldConfig,
+    SpringConfig,
+)
 
 VECTORS = igmm_tuning(IgmmConfig(sigma_ini=[0.1, 0.1, 1.0, 1.0, 1.0, 1.0]))
 
@@ -82,9 +86,7 @@ def test_a_constant_force_leaves_what_is_not_fed_forward(trusted):
     """F along x, constant (a spring so long that it is): the error is F / K_max without
     a model; with one it is (1 - lambda) F / K."""
     F = 12.0
-    world = PlanarWorldConfig(
-        anchors=[[1e4, 0.0]], stiffness=[F / 1e4], rest_length=[0.0]
-    )
+    world = PlanarWorldConfig(springs=[SpringConfig([1e4, 0.0], F / 1e4, 0.0)])
     law = PlanarImpedanceConfig(
         learn=False, adapt=trusted, steepness=4.0, error_mid=0.5
     )

@@ -36,6 +36,7 @@ from makebreak.systems.planar.planar_world import (
     CircleTargetConfig,
     PlanarWorld,
     PlanarWorldConfig,
+    SpringConfig,
     springs_of,
 )
 
@@ -245,7 +246,8 @@ def test_the_drawn_springs_pull_with_moderate_forces(seed):
     sizes = np.linalg.norm(forces, axis=1)
     # Nominally 7 to 40 N; stiffness and distance each within 20 %.
     assert 20.0 < sizes.max() < 75.0
-    assert (abs(np.array(world.stiffness) / [20.0, 40.0, 60.0] - 1.0) <= 0.2).all()
+    k = np.array([spring.stiffness for spring in world.springs])
+    assert (abs(k / [20.0, 40.0, 60.0] - 1.0) <= 0.2).all()
 
 
 def test_training_and_test_share_the_circle_but_neither_viscosity_nor_noise():
@@ -265,10 +267,13 @@ def test_training_and_test_share_the_circle_but_neither_viscosity_nor_noise():
         (dict(ramp_sec=-1.0), "ramp_sec is -1.0"),
         (dict(viscosity=[0.0, -1.0]), "viscosity is"),
         (dict(viscosity=[0.0]), "viscosity is"),
-        (dict(anchors=[[0.0, 1.0]]), "stiffness is .*expected 1 numbers"),
         (
-            dict(anchors=[[0.0, 1.0]], stiffness=[1.0], rest_length=[-0.1]),
-            "rest_length is",
+            dict(springs=[SpringConfig([0.0], 1.0, 0.1)]),
+            r"springs\[0\].anchor is \[0.0\]",
+        ),
+        (
+            dict(springs=[SpringConfig([0.0, 1.0], 1.0, -0.1)]),
+            r"springs\[0\] is .*rest_length=-0.1.* expected numbers >= 0",
         ),
     ],
 )

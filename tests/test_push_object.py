@@ -51,6 +51,7 @@ from makebreak.systems.contact_mpc.numerics.push_task import (
 from makebreak.systems.contact_mpc.push_goals import (
     PushGoals,
     PushGoalsConfig,
+    ReachedConfig,
     draw_poses,
     nearest_turn,
 )
@@ -275,7 +276,9 @@ def test_a_goal_is_over_when_it_is_reached_for_a_while_or_its_time_is_up():
     )
     near = [0.51, 0.005, -3.12]  # 11 mm, 0.06 rad the shorter way round.
     far = [0.6, 0.0, 0.0]
-    diagram, system = goals_at(x, [near, far, near], limit_sec=2.0, dwell_sec=0.25)
+    diagram, system = goals_at(
+        x, [near, far, near], limit_sec=2.0, reached=ReachedConfig(dwell_sec=0.25)
+    )
     simulator = Simulator(diagram)
     own = system.GetMyContextFromRoot(simulator.get_context())
 
@@ -513,8 +516,8 @@ def test_the_arm_goes_to_the_object_and_moves_it_towards_its_goal():
         for name in ("arm_reference", "contact_sampler")
     )
     assert np.hypot(*reference.wrist) > 0.1
-    assert reference.wrist == sampler.sampling.wrist
-    assert reference.nearest == pytest.approx(sampler.sampling.reach[0] - 0.01)
+    assert reference.wrist == sampler.sampling.reach.wrist
+    assert reference.nearest == pytest.approx(sampler.sampling.reach.range[0] - 0.01)
 
 
 @pytest.mark.parametrize("gentle", [False, True])
@@ -600,7 +603,7 @@ def test_a_setting_that_the_chosen_parts_do_not_read_is_refused(choice, setting,
 
 def test_the_wrist_is_the_arm_s_and_no_setting():
     config = PushObjectConfig()
-    config.sampler.sampling.wrist = [0.1, 0.0]
+    config.sampler.sampling.reach.wrist = [0.1, 0.0]
     with pytest.raises(ValueError, match="sampler.sampling"):
         make_push_object(config)
 

@@ -327,19 +327,37 @@ def test_readings_that_are_too_rare_or_too_late_are_refused():
 @pytest.mark.parametrize(
     ("setting", "says"),
     [
-        ("goals.tolerance=[0.02]", "goals.tolerance is [0.02], expected two numbers"),
-        ("goals.tolerance=[-1,-1]", "goals.tolerance is [-1.0, -1.0], expected > 0"),
-        ("goals.share=5", "goals.share is 5.0, expected > 0 and at most 1"),
+        (
+            "goals.reached.tolerance=[0.02]",
+            "goals.reached.tolerance is [0.02], expected two numbers",
+        ),
+        (
+            "goals.reached.tolerance=[-1,-1]",
+            "goals.reached.tolerance is [-1.0, -1.0], expected > 0",
+        ),
+        (
+            "goals.reached.share=5",
+            "goals.reached.share is 5.0, expected > 0 and at most 1",
+        ),
         ("goals.limit_sec=-1", "goals.limit_sec is -1.0, expected > 0"),
-        ("goals.dwell_sec=-1", "goals.dwell_sec is -1.0, expected >= 0"),
+        (
+            "goals.reached.dwell_sec=-1",
+            "goals.reached.dwell_sec is -1.0, expected >= 0",
+        ),
         ("goals.size=[0.1]", "goals.size is [0.1], expected two numbers"),
         (
             "sampler.sampling.height=0.3",
             "height is 0.3, expected above the tip's",
         ),
         ("object.height=0.02", "and below the object's top, 0.02 m"),
-        ("sampler.sampling.reach=[0.1]", "reach is [0.1], expected two numbers"),
-        ("sampler.sampling.hysteresis=[0.1]", "hysteresis is [0.1], expected two"),
+        (
+            "sampler.sampling.reach.range=[0.1]",
+            "reach.range is [0.1], expected two numbers",
+        ),
+        (
+            "sampler.sampling.change.hysteresis=[0.1]",
+            "hysteresis is [0.1], expected two",
+        ),
         ("sampler.sampling.places=2000", "expected an integer from 1 to 1000"),
         (
             "task.height=0.03",

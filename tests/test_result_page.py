@@ -1,6 +1,9 @@
 """report.html of a run, a sweep or a reproduction."""
 
+import json
 import re
+
+import numpy as np
 
 from makebreak.scripts.cli.commands import _of_targets
 from makebreak.scripts.runner.result_page import result_page
@@ -52,3 +55,27 @@ def test_a_reproduction_says_which_targets_are_missed():
     assert "Goals" not in result_page("t", *_of_targets([none]))
     met = Table("Walls", heads, rows, [True, True])
     assert "Goals met" in result_page("t", *_of_targets([met]))
+
+
+def test_a_recording_can_be_zoomed():
+    """Rows by quantity, a line a place; a line ends where an episode does."""
+    t = np.array([0.0, 0.5, 1.0, 0.0, 0.5])
+    columns = {
+        "time": t, "episode": np.array([0, 0, 0, 1, 1]), "arm.j1.position": t,
+        "arm.j2.position": 2.0 * t, "box.box.x": -t, "box.box.y": t,
+        "box.box.vx": np.full(5, np.nan),
+    }  # fmt: skip
+    assert "Plotly" not in result_page("t", [])
+    page = result_page("t", [], recorded=columns)
+    figure = json.loads(re.search(r"const figure = (.*);\n", page)[1])
+    titles = [each["text"] for each in figure["layout"]["annotations"]]
+    assert titles == ["position [rad or m]", "place x, y, z [m]"]
+    lines = {each["name"]: each for each in figure["data"]}
+    assert list(lines) == [*columns][2:6]
+    assert lines["arm.j2.position"]["y"] == [0.0, 1.0, 2.0, None, 0.0, 1.0]
+    assert lines["box.box.x"]["xaxis"] == "x2"
+    assert figure["layout"]["xaxis2"]["matches"] == "x"
+    long = {"time": np.arange(5000.0), "arm.j1.position": np.arange(5000.0)}
+    page = result_page("t", [], recorded=long)
+    figure = json.loads(re.search(r"const figure = (.*);\n", page)[1])
+    assert 400 < len(figure["data"][0]["x"]) <= 800

@@ -57,7 +57,7 @@ from makebreak.systems.contact_mpc.numerics.push_task import (
     TravelConfig,
     next_push,
 )
-from makebreak.systems.contact_mpc.numerics.rolling_task import CirclePath
+from makebreak.systems.contact_mpc.numerics.rolling_task import CircleConfig, CirclePath
 from makebreak.systems.contact_mpc.numerics.tip_travel import way_around, way_is_free
 from makebreak.systems.contact_mpc.path_target import PathTarget, PathTargetConfig
 from makebreak.systems.contact_mpc.push_task import PushTask, PushTaskConfig
@@ -186,10 +186,10 @@ def test_the_system_gives_target_and_goal_and_holds_them_for_bad_input():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"speed": 0.0}, "path.speed is 0.0"),
+        ({"circle": CircleConfig(speed=0.0)}, "path.circle.speed is 0.0"),
         ({"goal_deg": -1.0}, "path.goal_deg is -1.0"),
-        ({"lead_deg": -1.0}, "path.lead_deg is -1.0"),
-        ({"center": [0.5]}, "path.center"),
+        ({"circle": CircleConfig(lead_deg=-1.0)}, "path.circle.lead_deg is -1.0"),
+        ({"circle": CircleConfig([0.5])}, "path.circle.center"),
     ],
 )
 def test_a_path_out_of_range_is_named(change, message):
@@ -367,7 +367,8 @@ def test_a_place_that_is_reached_is_kept_for_a_while(planner):
         memory, found = SamplingMemory(), []
         for t in times:
             memory, one = sample_round(
-                replace(sampling, keep_sec=keep_sec), memory, plan.build_many, problem,
+                replace(sampling, change=replace(sampling.change, keep_sec=keep_sec)),
+                memory, plan.build_many, problem,
                 SHAPE, x, target, 0.01, True, t,
             )  # fmt: skip
             found.append(one.chosen)
@@ -505,8 +506,8 @@ def _set(config, setting, value):
         ({}, "contacts.gap_allowance", 0.002),
         ({}, "contacts.push.travel.speed", 0.5),
         ({"contact_sequence": "sampled"}, "task.rolling.reposition.lift", 0.02),
-        ({"contact_sequence": "sampled"}, "task.speed", 0.03),
-        ({"contact_sequence": "sampled"}, "planner.N", 6),
+        ({"contact_sequence": "sampled"}, "task.circle.speed", 0.03),
+        ({"contact_sequence": "sampled"}, "planner.options.N", 6),
         ({"contact_sequence": "sampled"}, "learning.eps", 1e-4),
         ({"contact_sequence": "sampled"}, "learning.posterior.drift", 0.01),
         ({"controller": "paper"}, "learning.posterior.hold_sec", 3.0),
@@ -522,7 +523,7 @@ def test_a_setting_that_the_chosen_parts_do_not_read_is_refused(choice, setting,
 
 
 def test_the_chosen_parts_settings_are_taken():
-    made = config(task=RollingTaskConfig(center=[0.52, 0.0], radius=0.09))
+    made = config(task=RollingTaskConfig(CircleConfig([0.52, 0.0], 0.09, speed=0.045)))
     made.learning.r_max = 0.6
     made.contacts.gap_allowance = 0.002
     make_ball_rolling(made)
@@ -549,7 +550,10 @@ def test_what_does_not_go_with_it_is_refused_in_one_line():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"path": PathTargetConfig(radius=0.2)}, "contacts.path.radius is 0.2"),
+        (
+            {"path": PathTargetConfig(CircleConfig(radius=0.2))},
+            "contacts.path.circle.radius is 0.2",
+        ),
         ({"push": PushConfig()}, "contacts.push.follow"),
         ({"learning_weight": -1.0}, "contacts.learning_weight is -1.0"),
         ({"learning_drift": -0.1}, "contacts.learning_drift is -0.1"),

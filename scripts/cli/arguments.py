@@ -244,8 +244,8 @@ def make_parser(functions: Mapping[str, Callable]) -> argparse.ArgumentParser:
     p.add_argument(
         "scene",
         metavar="SCENE",
-        help="the model: a scene file, a scene's name of `list`, or a .urdf or .sdf (a "
-        "scene is then proposed)",
+        help="the model: a scene file, a scene's name of `list`, or a robot's .urdf, "
+        ".xacro, .sdf or .xml (a scene is then proposed)",
     )
     p.add_argument(
         "recordings",
@@ -318,7 +318,7 @@ def make_parser(functions: Mapping[str, Callable]) -> argparse.ArgumentParser:
         help="design the motion to record, that tells parameters of a model best",
     )
     p.add_argument(
-        "scene", metavar="SCENE", help="a scene file, or a robot's .urdf or .sdf"
+        "scene", metavar="SCENE", help="a scene file, or a robot's .urdf, .sdf or .xml"
     )
     p.add_argument(
         "--for", dest="parameters", action="append", default=[], nargs="+",

@@ -169,7 +169,7 @@ def _page(session, name: str, result: dict, pictures, is_moving: bool) -> str:
     says = [*session.endings, *session.too_slow(), *(result.get("criteria") or [])]
     return result_page(
         f"makebreak run {name}", [_table(name, result)], result["success"], says,
-        pictures, is_moving, session.compared_by,
+        pictures, is_moving, session.compared_by, session.recorded,
     )  # fmt: skip
 
 

@@ -82,8 +82,8 @@ def run(config, session):
         record["loss"] = learner.GetOutputPort("loss")
         record["r_std"] = system("learned_std").get_output_port()
     at = plant.GetBodyByName("ball").floating_positions_start() + 4
-    center = np.array(config.task.center)
-    progress = Progress(center, config.task.radius)
+    center = np.array(config.task.circle.center)
+    progress = Progress(center, config.task.circle.radius)
     taken = any(read_fault(text).kind.on == "ball" for text in config.faults)
 
     def done(t, sample):
@@ -91,7 +91,7 @@ def run(config, session):
         angle = progress.went_to(p)
         stuck = t >= GIVE_UP_SEC and angle < np.pi / 2
         # Out of reach for good, that is: not in a hand.
-        lost = np.hypot(*(p - center)) > config.task.radius + LOST and not taken
+        lost = np.hypot(*(p - center)) > config.task.circle.radius + LOST and not taken
         return ending(angle, stuck, lost)
 
     log = session.simulate(diagram, DURATION_SEC, record, SAMPLE, until=done)
@@ -137,7 +137,7 @@ def run_on_lcm(config, session, url: str) -> dict:
     }
     if diagram.HasSubsystemNamed("residual_learner"):
         ports["r_std"] = system("residual_learner").GetOutputPort("r_std")
-    center, radius = np.array(config.task.center), config.task.radius
+    center, radius = np.array(config.task.circle.center), config.task.circle.radius
     rolled = Progress(center, radius)
 
     def done(t, sample) -> str:

@@ -225,12 +225,12 @@ def _variants() -> dict[str, dict]:
         "friction 0.3": {"start.friction": [0.3, 0.3]},
     }
     for what, settings in {
-        "10 % too small": {"size_error": 0.9},
-        "10 % too large": {"size_error": 1.1},
-        "half as heavy": {"mass_error": 0.5},
-        "twice as heavy": {"mass_error": 2.0},
-        "with half the friction": {"friction_error": 0.5},
-        "with twice the friction": {"friction_error": 2.0},
+        "10 % too small": {"model.size_error": 0.9},
+        "10 % too large": {"model.size_error": 1.1},
+        "half as heavy": {"model.mass_error": 0.5},
+        "twice as heavy": {"model.mass_error": 2.0},
+        "with half the friction": {"model.friction_error": 0.5},
+        "with twice the friction": {"model.friction_error": 2.0},
     }.items():
         found[f"modelled {what}"] = settings
         found[f"modelled {what}, adapting"] = {**settings, "adapt": True}

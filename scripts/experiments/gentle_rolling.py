@@ -101,7 +101,10 @@ class _Ending:
     """Whether the run is over: done, lost, or nothing has rolled for too long."""
 
     def __init__(self, ball, plant):
-        self._center, self._radius = np.array(ball.task.center), ball.task.radius
+        self._center, self._radius = (
+            np.array(ball.task.circle.center),
+            ball.task.circle.radius,
+        )
         self._at = plant.GetBodyByName("ball").floating_positions_start() + 4
         # As it is scored: where it does not count, the run may not end either.
         self._progress = rolling_score.Progress(self._center, self._radius)

@@ -4,6 +4,9 @@ opens without a network."""
 from collections.abc import Mapping, Sequence
 from html import escape
 
+import numpy as np
+
+from makebreak.gap.report.interactive import recording_html
 from makebreak.gap.report.markup import STYLE, folded, image
 from makebreak.scripts.runner.table import Table
 
@@ -19,12 +22,13 @@ def result_page(
     pictures: Mapping[str, bytes] | None = None,
     is_moving: bool = False,
     command: str = "",
+    recorded: Mapping[str, np.ndarray] | None = None,
 ) -> str:
     """The page.
 
     Args: success: None where there is nothing to succeed in; says: lines on the first
         screen; pictures: PNG files by name; is_moving: whether meshcat.html is beside
-        the page; command: to go on with.
+        the page; command: to go on with; recorded: columns of a recording.
     """
     colour = {True: _GOOD, False: _BAD, None: _NEUTRAL}[success]
     badge = {True: "Goals met", False: "Goals missed", None: "Results"}[success]
@@ -41,8 +45,14 @@ def result_page(
         if lines or moving
         else "",
         *(f"<section>{image(pictures, name, name)}</section>" for name in pictures),
-        *map(_table, tables),
     ]
+    if recorded:
+        body.append(
+            "<section><h2>Recording</h2><p class=small>Drag to zoom; click twice to "
+            f"see all again; the pointer tells values.</p>{recording_html(recorded)}"
+            "</section>"
+        )
+    body += map(_table, tables)
     if command:
         body.append(f"<p class=small>To go on:</p><pre>{escape(command)}</pre>")
     return (

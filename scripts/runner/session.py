@@ -126,6 +126,7 @@ class Session:
         self._timing = RunTiming()
         self._streams: list[Path] = []  # Recordings that are written while it runs.
         self._watched: list[np.ndarray] = []  # Output of each simulation's monitor.
+        self.recorded: Mapping[str, np.ndarray] = {}  # Columns of recording.csv.
         self.compared_by = ""  # The command that compares recording and model.
         # Of plots by name, and whether there is an animation: the text of report.html.
         self.report: Callable[[Mapping[str, bytes], bool], str] | None = None
@@ -366,6 +367,7 @@ class Session:
         written during the simulation.
         """
         self._drop_streams()
+        self.recorded = columns
         self._write("recording.csv", lambda path: write_recording(path, columns, noise))
         if scene is not None:
             says = "The controllers' model."

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
+from operator import attrgetter
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
@@ -30,6 +31,16 @@ DELAY_DAMPING_MAX = 0.5
 
 
 @dataclass
+class PostureConfig:
+    """What holds the posture of an arm that has more joints than its tool needs."""
+
+    # Stiffness of the posture, in the null space, per unit of inertia [1/s2].
+    stiffness: float = 100.0
+    # Damping of the posture, in the null space, per unit of inertia [1/s].
+    damping: float = 20.0
+
+
+@dataclass
 class ImpedanceConfig:
     """Settings of ImpedanceController: stiffness, damping, limits, posture."""
 
@@ -46,10 +57,7 @@ class ImpedanceConfig:
     # Energy that rises of a variable stiffness may take before the damping has taken
     # out more [J]; inf: any, the stiffness is used as it is asked for.
     energy_tank: float = 0.02
-    # Stiffness of the posture, in the null space, per unit of inertia [1/s2].
-    posture_stiffness: float = 100.0
-    # Damping of the posture, in the null space, per unit of inertia [1/s].
-    posture_damping: float = 20.0
+    posture: PostureConfig = field(default_factory=PostureConfig)
     period_sec: float = 0.001  # Period of the updates [s]; the diagram sets it.
     offset_sec: float = 0.0  # Time of the first update [s]; the diagram sets it.
 
@@ -158,9 +166,9 @@ class ImpedanceController(LeafSystem):
             gains = np.asarray(getattr(config, name), dtype=float)
             if gains.shape != (6,) or not np.all(gains >= 0.0):
                 raise ValueError(f"{name} is {gains}, expected 6 numbers of 0 or more")
-        for name in ("energy_tank", "posture_stiffness", "posture_damping"):
-            if not getattr(config, name) >= 0.0:
-                raise ValueError(f"{name} is {getattr(config, name)}, expected >= 0")
+        for name in ("energy_tank", "posture.stiffness", "posture.damping"):
+            if not (number := attrgetter(name)(config)) >= 0.0:
+                raise ValueError(f"{name} is {number}, expected >= 0")
         for name, number in (
             ("force_max", config.force_max),
             ("period_sec", config.period_sec),
@@ -190,8 +198,8 @@ class ImpedanceController(LeafSystem):
             damping=np.array(config.damping, dtype=float),
             force_max=float(config.force_max),
             tank=float(config.energy_tank),
-            posture_stiffness=float(config.posture_stiffness),
-            posture_damping=float(config.posture_damping),
+            posture_stiffness=float(config.posture.stiffness),
+            posture_damping=float(config.posture.damping),
             posture_every=max(1, round(0.012 / config.period_sec)),
             control_orientation=bool(config.control_orientation),
             period=float(config.period_sec),

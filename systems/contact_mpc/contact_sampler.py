@@ -4,6 +4,7 @@ from collections.abc import Sized
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import partial
+from operator import attrgetter
 from typing import Protocol
 
 import numpy as np
@@ -203,27 +204,25 @@ def _check(config: ContactSamplerConfig) -> None:
         raise ValueError(
             f"sampling.places is {c.places}, expected an integer from 1 to {PLACES_MAX}"
         )
-    for name in ("clearance", "height", "stuck_sec", "bearing"):
-        if not 0.0 < getattr(c, name) < np.inf:
-            raise ValueError(f"sampling.{name} is {getattr(c, name)}, expected > 0")
-    for name in ("travel", "push", "out_of_reach", "inwards"):
-        if not 0.0 <= getattr(c, name) < np.inf:
-            raise ValueError(f"sampling.{name} is {getattr(c, name)}, expected >= 0")
-    for name in ("hysteresis", "reach", "wrist"):
-        if np.shape(getattr(c, name)) != (2,):
-            raise ValueError(
-                f"sampling.{name} is {getattr(c, name)}, expected two numbers"
-            )
-    share, absolute = c.hysteresis
+    for name in ("clearance", "height", "change.stuck_sec", "reach.bearing"):
+        if not 0.0 < (value := attrgetter(name)(c)) < np.inf:
+            raise ValueError(f"sampling.{name} is {value}, expected > 0")
+    for name in ("change.travel", "push", "reach.cost", "reach.inwards"):
+        if not 0.0 <= (value := attrgetter(name)(c)) < np.inf:
+            raise ValueError(f"sampling.{name} is {value}, expected >= 0")
+    for name in ("change.hysteresis", "reach.range", "reach.wrist"):
+        if np.shape(value := attrgetter(name)(c)) != (2,):
+            raise ValueError(f"sampling.{name} is {value}, expected two numbers")
+    share, absolute = c.change.hysteresis
     if not (0.0 <= share < 1.0 and absolute >= 0.0):
         raise ValueError(
-            f"sampling.hysteresis is {c.hysteresis}, expected [share, cost] with "
-            "0 <= share < 1 and cost >= 0"
+            f"sampling.change.hysteresis is {c.change.hysteresis}, expected [share, "
+            "cost] with 0 <= share < 1 and cost >= 0"
         )
-    if not 0.0 <= c.reach[0] < c.reach[1]:
+    if not 0.0 <= c.reach.range[0] < c.reach.range[1]:
         raise ValueError(
-            f"sampling.reach is {c.reach}, expected [least, most] from the world's "
-            "origin in metres"
+            f"sampling.reach.range is {c.reach.range}, expected [least, most] from the "
+            "world's origin in metres"
         )
     for name in ("budget_sec", "residual_dt_sec", "period_sec"):
         if not getattr(config, name) > 0.0:

@@ -12,8 +12,10 @@ from makebreak.systems.contact_mpc.numerics.path_target import (
     next_waypoint,
 )
 from makebreak.systems.contact_mpc.numerics.rolling_task import (
+    CircleConfig,
     CirclePath,
     RollingConfig,
+    check_circle,
     shifted,
 )
 from makebreak.systems.numerics.settings import check_settings
@@ -26,13 +28,8 @@ AWAY = 0.001  # Distance of the tip's target from the ball, so that it is no pus
 class PathTargetConfig:
     """Settings of PathTarget."""
 
-    # Centre of the circle along which the ball is rolled, [x, y] [m]; the diagram sets
-    # it.
-    center: list[float] = field(default_factory=lambda: [0.5, 0.0])
-    radius: float = 0.1  # Radius of the circle [m]; the diagram sets it.
-    # Angle on the circle by which C3's target is ahead of the ball [deg].
-    lead_deg: float = 6.0
-    speed: float = 0.05  # Speed of C3's target along the circle [m/s].
+    # The diagram sets its centre and radius.
+    circle: CircleConfig = field(default_factory=CircleConfig)
     goal_deg: float = 10.0  # Angle on the circle from one goal to the next [deg].
     # Time constant of the integral action on the circle's radius [s]; inf: none.
     integral_sec: float = 6.0
@@ -77,17 +74,14 @@ class PathTarget(LeafSystem):
         super().__init__()
         check_settings(config)
         c = config
-        if np.shape(c.center) != (2,) or not np.isfinite(c.center).all():
-            raise ValueError(f"path.center is {c.center}, expected 2 numbers")
-        for name in ("radius", "speed", "goal_deg", "integral_sec", "height"):
+        check_circle(c.circle, "path.circle")
+        for name in ("goal_deg", "integral_sec", "height"):
             if not getattr(c, name) > 0.0:
                 raise ValueError(f"path.{name} is {getattr(c, name)}, expected > 0")
-        if not 0.0 <= c.lead_deg < np.inf:
-            raise ValueError(f"path.lead_deg is {c.lead_deg}, expected >= 0")
         self._config, self._n_knots, self._knot_sec = c, n_knots, knot_sec
         self._radius_ball, self._away = radius_ball, away
         self._n_tip, self._residual_dt_sec = n_tip, residual_dt_sec
-        self._path = CirclePath(np.array(c.center), c.radius)
+        self._path = CirclePath(np.array(c.circle.center), c.circle.radius)
         self._integral = RollingConfig(integral_sec=c.integral_sec)
         self._x = self.DeclareVectorInputPort("x", N_X)
         self._valid = self.DeclareVectorInputPort("valid", 1)
@@ -119,9 +113,9 @@ class PathTarget(LeafSystem):
         if valid[0] > 0.5:
             shift = shifted(self._integral, self._path, shift, x, c.period_sec)
         path = replace(self._path, radius=self._path.radius + shift)
-        lead = np.deg2rad(c.lead_deg)
+        lead = np.deg2rad(c.circle.lead_deg)
         target = moving_target(
-            path, x, lead, c.speed, c.height, away, self._radius_ball,
+            path, x, lead, c.circle.speed, c.height, away, self._radius_ball,
             self._knot_sec, self._n_knots,
         )  # fmt: skip
         last = float(context.get_discrete_state(self._angle).value()[0])

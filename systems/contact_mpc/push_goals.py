@@ -1,6 +1,7 @@
 """A sequence of goal poses for a pushed object."""
 
 from dataclasses import dataclass, field
+from operator import attrgetter
 
 import numpy as np
 from pydrake.systems.framework import LeafSystem
@@ -16,6 +17,20 @@ from makebreak.systems.numerics.timing import timed
 
 
 @dataclass
+class ReachedConfig:
+    """When a goal counts as reached."""
+
+    # Tolerances of a goal's position [m] and yaw [rad].
+    tolerance: list[float] = field(default_factory=lambda: [0.02, 0.1])
+    # Fraction of the tolerance below which the estimated errors have to stay for
+    # dwell_sec.
+    share: float = 0.8
+    # Time for which the estimated errors have to stay below share times the tolerance
+    # [s].
+    dwell_sec: float = 0.25
+
+
+@dataclass
 class PushGoalsConfig:
     """Settings of PushGoals: where goals are, and when one is reached."""
 
@@ -24,14 +39,7 @@ class PushGoalsConfig:
     center: list[float] = field(default_factory=lambda: [0.5, 0.0])
     # Lengths in x and y of the rectangle from which goals are drawn [m].
     size: list[float] = field(default_factory=lambda: [0.16, 0.36])
-    # Tolerances of a goal's position [m] and yaw [rad].
-    tolerance: list[float] = field(default_factory=lambda: [0.02, 0.1])
-    # Fraction of the tolerance below which the estimated errors have to stay for
-    # dwell_sec, until a goal counts as reached.
-    share: float = 0.8
-    # Time for which the estimated errors have to stay below share times the tolerance
-    # [s].
-    dwell_sec: float = 0.25
+    reached: ReachedConfig = field(default_factory=ReachedConfig)
     limit_sec: float = 60.0  # Time after which the next goal follows in any case [s].
     period_sec: float = 0.0125  # Period of the updates [s]; the diagram sets it.
     offset_sec: float = 0.0  # Time of the first update [s]; the diagram sets it.
@@ -131,9 +139,12 @@ class PushGoals(LeafSystem):
                 turn = turn_of(goal)
             goal[2] += turn
             off = errors(x, goal)
-            there = all(a < c.share * b for a, b in zip(off, c.tolerance, strict=True))
+            there = all(
+                a < c.reached.share * b
+                for a, b in zip(off, c.reached.tolerance, strict=True)
+            )
         held = held + c.period_sec if there else 0.0
-        if held >= c.dwell_sec or t - since >= c.limit_sec:
+        if held >= c.reached.dwell_sec or t - since >= c.limit_sec:
             number, since, held = number + 1.0, t, 0.0
             if number < len(self._goals):  # Now: others read it at this instant.
                 turn = turn_of(self._goals[int(number)]) if is_seen else np.nan
@@ -142,21 +153,22 @@ class PushGoals(LeafSystem):
 
 def _check(config: PushGoalsConfig) -> None:
     """Raises: ValueError that names a setting out of range."""
-    for name in ("center", "size", "tolerance"):
-        value = getattr(config, name)
+    for name in ("center", "size", "reached.tolerance"):
+        value = attrgetter(name)(config)
         if np.shape(value) != (2,) or not np.isfinite(value).all():
             raise ValueError(f"goals.{name} is {value}, expected two numbers")
     if min(config.size) < 0.0:
         raise ValueError(f"goals.size is {config.size}, expected at least 0")
-    if not min(config.tolerance) > 0.0:
-        raise ValueError(f"goals.tolerance is {config.tolerance}, expected > 0")
-    if not 0.0 < config.share <= 1.0:
+    r = config.reached
+    if not min(r.tolerance) > 0.0:
+        raise ValueError(f"goals.reached.tolerance is {r.tolerance}, expected > 0")
+    if not 0.0 < r.share <= 1.0:
         raise ValueError(
-            f"goals.share is {config.share}, expected > 0 and at most 1: a goal is "
+            f"goals.reached.share is {r.share}, expected > 0 and at most 1: a goal is "
             "left where it was reached"
         )
     for name in ("limit_sec", "period_sec"):
         if not 0.0 < getattr(config, name) < np.inf:
             raise ValueError(f"goals.{name} is {getattr(config, name)}, expected > 0")
-    if not 0.0 <= config.dwell_sec < np.inf:
-        raise ValueError(f"goals.dwell_sec is {config.dwell_sec}, expected >= 0")
+    if not 0.0 <= r.dwell_sec < np.inf:
+        raise ValueError(f"goals.reached.dwell_sec is {r.dwell_sec}, expected >= 0")

@@ -11,9 +11,11 @@ from makebreak.systems.contact_mpc.numerics.ball_state import N_X, P_BALL, V_BAL
 from makebreak.systems.contact_mpc.numerics.rolling_task import (
     ROLL,
     WAIT,
+    CircleConfig,
     CirclePath,
     RollingConfig,
     TaskState,
+    check_circle,
     next_state,
     shifted,
     target_over_horizon,
@@ -39,12 +41,7 @@ UPHILL = 0.25
 class RollingTaskConfig:
     """Settings of RollingTask: the circle, the goal ahead of the ball, the rolling."""
 
-    # Centre of the circle along which the ball is rolled, [x, y] [m].
-    center: list[float] = field(default_factory=lambda: [0.5, 0.0])
-    radius: float = 0.1  # Radius of the circle [m].
-    # Angle on the circle by which C3's target is ahead of the ball [deg].
-    lead_deg: float = 6.0
-    speed: float = 0.045  # Speed of C3's target along the circle [m/s].
+    circle: CircleConfig = field(default_factory=lambda: CircleConfig(speed=0.045))
     # Depth of the tip's target below the place where it touches the learned ball's top
     # [m].
     press: float = 0.045
@@ -102,7 +99,7 @@ class RollingTask(LeafSystem):
         self._config, self._n_knots, self._knot_sec = config, n_knots, knot_sec
         self._radius_ball, self._radius_tip = radius_ball, radius_tip
         self._n_tip, self._residual_dt_sec = n_tip, residual_dt_sec
-        self._path = CirclePath(np.array(config.center), config.radius)
+        self._path = CirclePath(np.array(config.circle.center), config.circle.radius)
         self._x = self.DeclareVectorInputPort("x", N_X)
         self._valid = self.DeclareVectorInputPort("valid", 1)
         self._r_comp = self.DeclareVectorInputPort("r_comp", n_lam)
@@ -180,8 +177,8 @@ class RollingTask(LeafSystem):
         # that is larger than modelled would be pressed harder.
         z_tip = 2.0 * self._radius_ball + self._radius_tip - gap - c.press
         goal = target_over_horizon(
-            path, x, np.deg2rad(c.lead_deg), c.speed, z_tip, self._radius_ball,
-            self._knot_sec, self._n_knots,
+            path, x, np.deg2rad(c.circle.lead_deg), c.circle.speed, z_tip,
+            self._radius_ball, self._knot_sec, self._n_knots,
         )  # fmt: skip
         state.get_mutable_abstract_state(int(self._ball)).set_value(ball)
         discrete = state.get_mutable_discrete_state()
@@ -205,15 +202,12 @@ class RollingTask(LeafSystem):
 def _check(config: RollingTaskConfig):
     """Raises: ValueError that names a setting out of range."""
     rolling = config.rolling
-    for name in ("center", "withdrawn"):
-        place = getattr(config, name)
-        if np.shape(place) != (2,) or not np.isfinite(place).all():
-            raise ValueError(f"task.{name} is {place}, expected 2 numbers")
-    if not 0.0 < config.radius < np.inf:
-        raise ValueError(f"task.radius is {config.radius}, expected > 0")
-    for name in ("speed", "lead_deg", "press"):
-        if not np.isfinite(getattr(config, name)):
-            raise ValueError(f"task.{name} is {getattr(config, name)}, expected finite")
+    check_circle(config.circle, "task.circle")
+    place = config.withdrawn
+    if np.shape(place) != (2,) or not np.isfinite(place).all():
+        raise ValueError(f"task.withdrawn is {place}, expected 2 numbers")
+    if not np.isfinite(config.press):
+        raise ValueError(f"task.press is {config.press}, expected finite")
     for name in ("roll.sec", "roll.feel_sec", "reposition.sec", "reposition.far",
                  "approach.speed", "approach.touch_force", "land.above",
                  "land.coast_change", "unseen.drift", "unseen.withdraw_speed",

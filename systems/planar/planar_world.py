@@ -15,6 +15,16 @@ from makebreak.systems.planar.numerics.planar_world import (
 
 
 @dataclass
+class SpringConfig:
+    """A spring between the point and a place in the plane."""
+
+    anchor: list[float]  # [x, y] [m]
+    stiffness: float  # [N/m]
+    rest_length: float  # [m]
+    reach: float = np.inf  # Largest length at which it pulls [m].
+
+
+@dataclass
 class PlanarWorldConfig:
     """A point in the plane, and the springs or the porridge that it meets."""
 
@@ -22,11 +32,7 @@ class PlanarWorldConfig:
     # Initial and final viscosity [N s/m]; it rises over ramp_sec, from time 0 on.
     viscosity: list[float] = field(default_factory=lambda: [0.0, 0.0])
     ramp_sec: float = 6.0
-    anchors: list[list[float]] = field(default_factory=list)  # Of the springs [m].
-    stiffness: list[float] = field(default_factory=list)  # One per anchor [N/m].
-    rest_length: list[float] = field(default_factory=list)  # One per anchor [m].
-    # One per anchor: largest length at which the spring pulls [m]. None: no limit.
-    reach: list[float] | None = None
+    springs: list[SpringConfig] = field(default_factory=list)
     period_sec: float = 0.001
 
 
@@ -35,21 +41,16 @@ def springs_of(config: PlanarWorldConfig) -> tuple[np.ndarray, np.ndarray]:
 
     Raises: ValueError that names a setting out of range.
     """
-    c = config
-    anchors = np.array(c.anchors, dtype=float).reshape(-1, 2)
-    n = len(anchors)
-    springs = np.full((n, 3), np.inf)
-    for i, name in enumerate(("stiffness", "rest_length", "reach")):
-        if getattr(c, name) is None:
-            continue
-        values = np.array(getattr(c, name), dtype=float)
-        if values.shape != (n,) or not np.all(values >= 0.0):
-            raise ValueError(
-                f"{name} is {getattr(c, name)}, expected {n} numbers >= 0, one per "
-                "anchor"
-            )
-        springs[:, i] = values
-    return anchors, springs
+    anchors, springs = [], []
+    for k, spring in enumerate(config.springs):
+        numbers = [spring.stiffness, spring.rest_length, spring.reach]
+        if np.shape(spring.anchor) != (2,) or not np.isfinite(spring.anchor).all():
+            raise ValueError(f"springs[{k}].anchor is {spring.anchor}, expected [x, y]")
+        if not min(numbers) >= 0.0:
+            raise ValueError(f"springs[{k}] is {spring}, expected numbers >= 0")
+        anchors.append(spring.anchor)
+        springs.append(numbers)
+    return np.reshape(anchors, (-1, 2)), np.reshape(springs, (-1, 3))
 
 
 class PlanarWorld(LeafSystem):

@@ -106,7 +106,7 @@ def ground_truth(config, log, plant) -> Track:
         p_tip[i] = tip.CalcPoseInWorld(context).translation()
         X_ball = plant.EvalBodyPoseInWorld(context, ball)
         p_ball[i], R_ball[i] = X_ball.translation(), X_ball.rotation().matrix()
-    center = np.array(config.task.center)
+    center = np.array(config.task.circle.center)
     model, _ = controller_model(config)
     world = load_scene(world_scene(config), DiagramBuilder())
     r_tip = sphere_radius(world.plant, world.scene_graph, TOOL)
@@ -122,8 +122,10 @@ def ground_truth(config, log, plant) -> Track:
         time=log.time,
         p_ball=p_ball,
         p_tip=p_tip,
-        progress=progress_of(p_ball, center, config.task.radius),
-        error=abs(np.linalg.norm(p_ball[:, :2] - center, axis=1) - config.task.radius),
+        progress=progress_of(p_ball, center, config.task.circle.radius),
+        error=abs(
+            np.linalg.norm(p_ball[:, :2] - center, axis=1) - config.task.circle.radius
+        ),
         gap=log["gap"][:, 0],
         gap_true=distance - modelled,
         gap_std=LEARN * log["r_std"][:, 0] if "r_std" in log else 0.0 * log.time,
@@ -246,8 +248,8 @@ def plot_path(session, config, track):
     """Fig. 5: the ball's track beside the target path."""
     fig, ax = plt.subplots(figsize=(5, 5), layout="constrained")
     angle = np.linspace(0.0, 2.0 * np.pi, 200)
-    x, y = config.task.center
-    radius = config.task.radius
+    x, y = config.task.circle.center
+    radius = config.task.circle.radius
     ax.plot(
         x + radius * np.cos(angle), y + radius * np.sin(angle), "k--", label="target"
     )

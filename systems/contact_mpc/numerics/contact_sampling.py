@@ -45,16 +45,12 @@ PROGRESS = 0.003  # Less than this towards the goal is none [m].
 
 
 @dataclass
-class SamplingConfig:
-    """What a round of ContactSampler looks at, and what it prefers."""
+class ReachConfig:
+    """Where the arm reaches."""
 
-    # Number of places sampled in a round, beside the present one and the last best.
-    places: int = 14
-    clearance: float = 0.004  # Clearance of the tip from the object at a place [m].
-    height: float = 0.024  # Height of the tip's centre while it pushes [m].
     # Reach of the arm, [least, largest] [m]: least distance of the wrist from the arm's
     # base, nearer than which the elbow is at its limit, and largest of the tip.
-    reach: list[float] = field(default_factory=lambda: [0.41, 0.78])
+    range: list[float] = field(default_factory=lambda: [0.41, 0.78])
     # Vector from the wrist to the tip, seen from above, where the tool's turn is held,
     # [x, y] [m]; push_object sets it.
     wrist: list[float] = field(default_factory=lambda: [0.0, 0.0])
@@ -63,21 +59,39 @@ class SamplingConfig:
     bearing: float = 1.05
     # Cost of a plan that leads the tip out of reach, for each knot: it will not be
     # carried out as it is [1/m2].
-    out_of_reach: float = 2e4
-    # Length by which a plan may lead the wrist nearer than reach[0] at no cost [m].
+    cost: float = 2e4
+    # Length by which a plan may lead the wrist nearer than range[0] at no cost [m].
     inwards: float = 0.01
+
+
+@dataclass
+class ChangeConfig:
+    """When the tip leaves a place for another one."""
+
     travel: float = 15.0  # Cost of a metre of the tip's path through the air [1/m].
     # Amount by which another place has to cost less than the present one, [fraction of
     # the present cost, absolute cost].
     hysteresis: list[float] = field(default_factory=lambda: [0.15, 1.0])
-    # Force of the plan that is tried first, straight into the object [N].
-    push: float = 4.0
     # Time without progress after which the present place is given up [s].
     stuck_sec: float = 1.2
+    keep_sec: float = 0.0  # Time for which a place that was reached is kept [s].
+
+
+@dataclass
+class SamplingConfig:
+    """What a round of ContactSampler looks at, and what it prefers."""
+
+    # Number of places sampled in a round, beside the present one and the last best.
+    places: int = 14
+    clearance: float = 0.004  # Clearance of the tip from the object at a place [m].
+    height: float = 0.024  # Height of the tip's centre while it pushes [m].
+    reach: ReachConfig = field(default_factory=ReachConfig)
+    change: ChangeConfig = field(default_factory=ChangeConfig)
+    # Force of the plan that is tried first, straight into the object [N].
+    push: float = 4.0
     # Whether the tip arrives at a place with the velocity of the object, for one that
     # rolls on by itself; always so for a cylinder.
     follow: bool = False
-    keep_sec: float = 0.0  # Time for which a place that was reached is kept [s].
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,16 +228,19 @@ def sample_round(
     way = _way_lengths(c, shape, x, places, outline, distance)
     if in_contact:
         way[0] = 0.0
-    elif not going or not in_reach(places[:1], c.reach, c.bearing, c.wrist)[0]:
+    elif (
+        not going
+        or not in_reach(places[:1], c.reach.range, c.reach.bearing, c.reach.wrist)[0]
+    ):
         cost[0] = NO_PLAN
     # Where the tip is now no plan can change.
-    led_out = out_of_reach(plans[:, 1:], c.reach, c.inwards, c.wrist)
-    cost = cost + c.travel * way + c.out_of_reach * led_out
+    led_out = out_of_reach(plans[:, 1:], c.reach.range, c.reach.inwards, c.reach.wrist)
+    cost = cost + c.change.travel * way + c.reach.cost * led_out
     m, is_stuck = _with_progress(c, m, error, in_contact, t)
     if is_stuck:
         cost[0] = NO_PLAN
-    keep = m.reached_sec is not None and t - m.reached_sec < c.keep_sec
-    chosen = 0 if keep and np.isfinite(cost[0]) else choose(cost, c.hysteresis)
+    keep = m.reached_sec is not None and t - m.reached_sec < c.change.keep_sec
+    chosen = 0 if keep and np.isfinite(cost[0]) else choose(cost, c.change.hysteresis)
     m = replace(m, count=m.count + 1)
     known = np.isfinite(cost)
     if known[1:].any():
@@ -243,7 +260,10 @@ def _places(
     around = places_around(outline, distance, c.places, (m.count * GOLDEN) % 1.0)
     others = [around] if m.best is None else [to_world(x, m.best)[None], around]
     present = to_world(x, m.place) if going else x[P_TIP][:2]
-    near = [each[in_reach(each, c.reach, c.bearing, c.wrist)] for each in others]
+    near = [
+        each[in_reach(each, c.reach.range, c.reach.bearing, c.reach.wrist)]
+        for each in others
+    ]
     return np.concatenate([present[None], *near])
 
 
@@ -278,7 +298,7 @@ def _with_progress(
     progressed = (
         not in_contact or error < m.error - PROGRESS or not np.isfinite(m.error)
     )
-    is_stuck = not progressed and t - m.since_sec > c.stuck_sec
+    is_stuck = not progressed and t - m.since_sec > c.change.stuck_sec
     if progressed or is_stuck:
         m = replace(m, error=error, since_sec=t)
     if not in_contact:

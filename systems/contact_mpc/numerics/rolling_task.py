@@ -51,6 +51,30 @@ GLIMPSE_SEC = 0.1  # The velocity of a ball that was seen for less is not known 
 SHIFT_MAX = 0.008  # The circle aimed at differs from the path by at most this [m].
 
 
+@dataclass
+class CircleConfig:
+    """The circle along which a ball is rolled, and how C3's target moves along it."""
+
+    # Centre of the circle, [x, y] [m].
+    center: list[float] = field(default_factory=lambda: [0.5, 0.0])
+    radius: float = 0.1  # Radius of the circle [m].
+    # Angle on the circle by which C3's target is ahead of the ball [deg].
+    lead_deg: float = 6.0
+    speed: float = 0.05  # Speed of C3's target along the circle [m/s].
+
+
+def check_circle(circle: CircleConfig, name: str) -> None:
+    """Raises: ValueError that names a setting out of range, of `name`."""
+    c = circle
+    if np.shape(c.center) != (2,) or not np.isfinite(c.center).all():
+        raise ValueError(f"{name}.center is {c.center}, expected 2 numbers")
+    for key in ("radius", "speed"):
+        if not 0.0 < getattr(c, key) < np.inf:
+            raise ValueError(f"{name}.{key} is {getattr(c, key)}, expected > 0")
+    if not 0.0 <= c.lead_deg < np.inf:
+        raise ValueError(f"{name}.lead_deg is {c.lead_deg}, expected >= 0")
+
+
 @dataclass(frozen=True, eq=False)
 class CirclePath:
     """A circle on the table, run through counter-clockwise seen from above."""
