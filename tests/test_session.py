@@ -547,6 +547,10 @@ def test_a_table_fits_the_terminal():
         "             words than fit",
     ]
     assert table.to_text(200) == table.to_text()
+    rows = [("a_name_that_is_long", "some words"), ("b", "many words of a sentence")]
+    lines = Table("t", ("at", "why"), rows).to_text(38).splitlines()
+    assert lines[4] == "a_name_that_is_long  some words"
+    assert lines[5:7] == [f"{'b':19}  many words of a", " " * 21 + "sentence"]
 
 
 @pytest.mark.parametrize(

@@ -81,14 +81,21 @@ class Table:
             bool(self.rows) and all(_is_number(row[j]) for row in self.rows)
             for j in range(len(self.columns))
         ] + [False] * (len(heads) - len(self.columns))
-        texts = [j for j, r in enumerate(right) if not r]
         over = 0 if width is None else sum(widths) + 2 * len(widths) - 2 - width
-        while over > 0 and texts:  # The widest gives way, down to the next one.
-            j = max(texts, key=lambda j: widths[j])
-            if widths[j] <= _NARROW:
-                break
-            widths[j] -= 1
-            over -= 1
+        columns = list(zip(heads, *rows, strict=True))
+        longest = [
+            [max(map(len, c.split()), default=1) for c in col] for col in columns
+        ]
+        for least in (  # Words are broken where it has to be: first those of headings.
+            [max(of) for of in longest],
+            [max([_NARROW // 2, *of[1:]]) for of in longest],
+            [max(longest[j][1:]) if r else _NARROW for j, r in enumerate(right)],
+        ):  # fmt: skip
+            while over > 0 and (
+                can := [j for j, w in enumerate(widths) if w > least[j]]
+            ):
+                widths[max(can, key=widths.__getitem__)] -= 1
+                over -= 1
 
         def line(cells):
             parts = [wrap(c, w) or [""] for c, w in zip(cells, widths, strict=True)]
