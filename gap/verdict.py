@@ -387,7 +387,7 @@ def _apart_from(effects: Sequence[NamedEffect]) -> str:
         if kinds:
             text += f" These data cannot distinguish {it} from {', '.join(kinds)}."
         if places:
-            it = it[:1].upper() + it[1:]
+            it = "It" if it == "it" else f"The {it}"
             text += f" {it} could equally be at {' or '.join(places)}."
     for each in effects:
         for rival in each.sets:

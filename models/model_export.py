@@ -371,8 +371,8 @@ def joint_numbers(loaded: LoadedScene, joint: Joint) -> JointNumbers:
 
 # A simulation in Isaac Lab, and what it may not have.
 _ISAAC_LAB = '''\
-"""The drives of a repaired model, for Isaac Lab 2.2 and newer (with Isaac Sim 5 and
-newer, where joint friction is an effort).
+"""The drives of a repaired model, for Isaac Lab 2.2 to 3 (with Isaac Sim 5 and newer,
+where joint friction is an effort).
 
     ArticulationCfg(..., actuators=ACTUATORS)
 

@@ -131,7 +131,9 @@ for name, (_, places, _) in runs.items():
 
 # %%
 # With the wrong radius the plan has its contact where there is none, and the puck
-# stops short of the goal. With the learner it arrives.
+# stops short of the goal. With the learner it arrives. What is learned comes near the
+# true distance within a second. Later both hardly move, so that the small force between
+# them tells little: it ends 1 to 2 mm too large, which does no harm at rest.
 
 figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
 for name, (t, places, _) in runs.items():
