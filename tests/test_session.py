@@ -547,6 +547,7 @@ def test_a_table_fits_the_terminal():
         "             words than fit",
     ]
     assert table.to_text(200) == table.to_text()
+    assert Table("t", ("a", "b"), [], notes=["n"]).to_text() == "t\n\nn\n"
     rows = [("a_name_that_is_long", "some words"), ("b", "many words of a sentence")]
     lines = Table("t", ("at", "why"), rows).to_text(38).splitlines()
     assert lines[4] == "a_name_that_is_long  some words"

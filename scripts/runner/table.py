@@ -113,7 +113,8 @@ class Table:
             each if width is None else fill(each, width)
             for each in (self.title, *self.notes)
         ]
-        lines = [around[0], "", line(heads), rule, *map(line, rows), *around[1:]]
+        body = [line(heads), rule, *map(line, rows)] if rows else []
+        lines = [around[0], "", *body, *around[1:]]
         return "\n".join(lines) + "\n"
 
     def transposed(self) -> "Table":
