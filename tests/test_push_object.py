@@ -63,7 +63,6 @@ from makebreak.systems.perception.numerics.pose_filter import (
     turn_between,
     turned,
 )
-from makebreak.systems.perception.numerics.state_estimator import with_pose
 from makebreak.systems.perception.pose_sensor import PoseSensor, PoseSensorConfig
 from makebreak.systems.views.contact_probe import ContactLoad
 
@@ -244,18 +243,6 @@ def test_the_speed_of_what_rolls_on_is_known_well_and_a_push_is_seen_as_soon():
 
 
 # The estimator's option, and the goals.
-
-
-def test_a_known_pose_takes_the_place_of_rolling():
-    x = np.arange(19.0)
-    q, w = np.array([2.0, 0.0, 0.0, 0.0]), np.array([0.1, 0.2, 0.3])
-    finite, after, valid = with_pose(True, x, 1.0, q, w)
-    assert finite and valid == 1.0
-    np.testing.assert_array_equal(after[Q_BALL], [1.0, 0, 0, 0])
-    np.testing.assert_array_equal(after[13:16], w)
-    for bad in (np.full(4, np.nan), np.zeros(4)):
-        assert with_pose(True, x, 1.0, bad, w)[0] is False
-    assert with_pose(True, x, 1.0, q, w * np.nan)[2] == -1.0
 
 
 def goals_at(x, goals, fold=1, **config):

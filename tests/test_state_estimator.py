@@ -7,6 +7,7 @@ from pydrake.multibody.tree import JacobianWrtVariable, MultibodyForces
 
 from makebreak.diagrams.station import TIP_FRAME, make_control_plant
 from makebreak.systems.arm.impedance_controller import serial_chain_of
+from makebreak.systems.arm.numerics.serial_chain import chain_state
 from makebreak.systems.contact_mpc.numerics.ball_state import (
     P_BALL,
     P_TIP,
@@ -123,6 +124,22 @@ def test_x_has_the_layout_of_the_lcs_and_a_ball_that_rolls(bench, arm):
     np.testing.assert_allclose(slip, 0.0, atol=1e-17)
 
 
+def test_a_known_pose_takes_the_place_of_rolling(bench):
+    pose = dict(q_object=[2.0, 0.0, 0.0, 0.0], w_object=[0.1, 0.2, 0.3])
+    x, _, valid = bench.tick(**pose)
+    assert valid == 1.0
+    np.testing.assert_array_equal(x[Q_BALL], [1.0, 0.0, 0.0, 0.0])
+    np.testing.assert_array_equal(x[W_BALL], pose["w_object"])
+    for name, bad in (
+        ("q_object", np.full(4, np.nan)),
+        ("q_object", np.zeros(4)),
+        ("w_object", np.full(3, np.nan)),
+    ):
+        held, _, valid = bench.tick(**pose | {name: bad, "p_ball": [0.0, 0.0, 0.0]})
+        assert valid == -1.0
+        np.testing.assert_array_equal(held, x)
+
+
 def test_before_the_first_reading_the_tip_is_at_its_default_and_nothing_is_valid(
     bench, arm
 ):
@@ -149,7 +166,7 @@ def test_the_input_beside_the_real_force_makes_the_point_move_as_the_tip(arm, ch
         a = free + J @ np.linalg.solve(arm.CalcMassMatrix(context), J.T @ force)
         u = tip_motion(chain, q, v, torque, MASS)[2]
         found = input_with_force(
-            u, v_tip - dt * a, v_tip, tip_mobility(chain, q), MASS, dt
+            u, v_tip - dt * a, v_tip, tip_mobility(chain_state(chain, q, v)), MASS, dt
         )
         np.testing.assert_allclose((found + force) / MASS, a, atol=1e-8)
 
@@ -282,5 +299,6 @@ def test_mobility_of_the_tip_is_drakes(chain, arm):
         arm.world_frame(),
     )  # fmt: skip
     M = arm.CalcMassMatrixViaInverseDynamics(context)  # Rotors included.
-    ours = tip_mobility(chain, arm.GetPositions(context))
+    q = arm.GetPositions(context)
+    ours = tip_mobility(chain_state(chain, q, np.zeros(q.size)))
     np.testing.assert_allclose(ours, J @ np.linalg.solve(M, J.T), rtol=1e-9, atol=1e-12)

@@ -8,18 +8,12 @@ from pydrake.systems.framework import LeafSystem
 
 from makebreak.systems.arm.numerics.packed import packed
 from makebreak.systems.arm.numerics.serial_chain import SerialChain
-from makebreak.systems.contact_mpc.numerics.ball_state import V_TIP, pack
+from makebreak.systems.arm.numerics.tip_state import tip_pose
+from makebreak.systems.contact_mpc.numerics.ball_state import pack
 from makebreak.systems.numerics.first_calls import first_call
 from makebreak.systems.numerics.settings import check_settings
 from makebreak.systems.numerics.timing import timed
-from makebreak.systems.perception.numerics.state_estimator import (
-    estimate,
-    input_with_force,
-    observe_force,
-    tip_mobility,
-    tip_motion,
-    with_pose,
-)
+from makebreak.systems.perception.numerics.state_estimator import estimate
 
 
 @dataclass
@@ -74,20 +68,36 @@ class StateEstimator(LeafSystem):
                 "ball_radius and tip_mass must be positive, got "
                 f"{config.ball_radius}, {config.tip_mass}"
             )
-        self._ball_radius, self._tip_mass = config.ball_radius, config.tip_mass
-        self._chain, self._packed = chain, packed(chain)
+        self._numbers = tuple(
+            float(number)
+            for number in (
+                config.tip_mass,
+                config.ball_radius,
+                config.force_bandwidth,
+                config.period_sec,
+            )
+        )
+        self._chain = packed(chain)
         n = len(chain.mass)
         self.q_default = q_default = np.array(q_default, dtype=float)
-        p_tip, _, _ = tip_motion(self._chain, q_default, np.zeros(n), np.zeros(n), 1.0)
+        p_tip = tip_pose(self._chain, q_default)[:3]
         n_window = max(1, round(config.window_sec / config.period_sec))
-        self._q = self.DeclareVectorInputPort("q", n)
-        self._v = self.DeclareVectorInputPort("v", n)
-        self._torque = self.DeclareVectorInputPort("torque", n)
-        self._p_ball = self.DeclareVectorInputPort("p_ball", 3)
-        self._v_ball = self.DeclareVectorInputPort("v_ball", 3)
-        self._seen = self.DeclareVectorInputPort("seen", 1)
-        self._q_object = self.DeclareVectorInputPort("q_object", 4)
-        self._w_object = self.DeclareVectorInputPort("w_object", 3)
+        self._readings = [
+            self.DeclareVectorInputPort(name, size)
+            for name, size in (
+                ("q", n),
+                ("v", n),
+                ("torque", n),
+                ("p_ball", 3),
+                ("v_ball", 3),
+                ("seen", 1),
+            )
+        ]
+        self._pose = [
+            self.DeclareVectorInputPort(name, size)
+            for name, size in (("q_object", 4), ("w_object", 3))
+        ]
+        self._no_pose = [np.zeros(0), np.zeros(0)]
         x0 = pack(p_tip, np.zeros(3), [0, 0, config.ball_radius], np.zeros(3), 1.0)
         self._x = self.DeclareDiscreteState(x0)
         # The forces of the window, and the number of valid readings in a row. At the
@@ -98,7 +108,8 @@ class StateEstimator(LeafSystem):
         self._valid = self.DeclareDiscreteState(1)
         self._observer = self.DeclareDiscreteState(7)
         self._with_force = self.DeclareDiscreteState(3 * n_window)
-        self._gain, self._dt = config.force_bandwidth, config.period_sec
+        # What `estimate` takes and returns, in its order.
+        self._states = [self._x, self._window, self._observer, self._with_force]
         self.DeclareStateOutputPort("x", self._x)
         self.DeclareVectorOutputPort(
             "u_measured",
@@ -128,23 +139,15 @@ class StateEstimator(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(
             config.period_sec, config.offset_sec, self._update
         )
-        first_call(self._first_call, q_default)
+        first_call(self._first_call)
 
-    def _first_call(self, q_default: np.ndarray):
-        zero, before = np.zeros(q_default.size), np.zeros(3 * self._n_window + 1)
-        before.setflags(write=False)  # As a Context's state is.
-        at = np.zeros(3)
-        estimate(
-            self._packed, q_default, zero, zero, at, at, np.zeros(1), self._tip_mass,
-            self._ball_radius, before,
-        )  # fmt: skip
-        observer = np.zeros(7)
-        observer.setflags(write=False)
-        mobility = tip_mobility(self._chain, q_default)
-        observe_force(observer, at, at, mobility, self._gain, self._dt)
-        before = at.view()
-        before.setflags(write=False)  # Of the state of a Context.
-        input_with_force(at, before, at, mobility, self._tip_mass, self._dt)
+    def _first_call(self):
+        readings = [np.zeros(port.size()) for port in self._readings]
+        states = [np.zeros(n) for n in (19, 3 * self._n_window + 1, 7)]
+        states.append(np.zeros(3 * self._n_window))
+        for state in states:
+            state.setflags(write=False)  # As a Context's state is.
+        estimate(self._chain, *readings, *self._no_pose, *self._numbers, *states)
 
     def _mean_force(self, context, output):
         window = context.get_discrete_state(self._window).value()
@@ -171,53 +174,16 @@ class StateEstimator(LeafSystem):
 
     @timed
     def _update(self, context, discrete_state):
-        window = context.get_discrete_state(self._window).value()
-        finite, felt, x, after, valid = estimate(
-            self._packed,
-            self._q.Eval(context),
-            self._v.Eval(context),
-            self._torque.Eval(context),
-            self._p_ball.Eval(context),
-            self._v_ball.Eval(context),
-            self._seen.Eval(context),
-            self._tip_mass,
-            self._ball_radius,
-            window,
+        pose = self._no_pose
+        if all(port.HasValue(context) for port in self._pose):
+            pose = [port.Eval(context) for port in self._pose]
+        *states, valid = estimate(
+            self._chain,
+            *[port.Eval(context) for port in self._readings],
+            *pose,
+            *self._numbers,
+            *[context.get_discrete_state(state).value() for state in self._states],
         )
-        if self._q_object.HasValue(context) and self._w_object.HasValue(context):
-            finite, x, valid = with_pose(
-                finite,
-                x,
-                valid,
-                np.asarray(self._q_object.Eval(context)),
-                np.asarray(self._w_object.Eval(context)),
-            )
+        for state, value in zip(self._states, states, strict=True):
+            discrete_state.set_value(state, value)
         discrete_state.set_value(self._valid, [valid])
-        with_force = np.full(3, np.nan)
-        if finite:
-            discrete_state.set_value(self._x, x)
-            discrete_state.set_value(self._window, after)
-            observer = context.get_discrete_state(self._observer).value()
-            if felt:
-                u = after[-4:-1]
-                mobility = tip_mobility(self._chain, np.asarray(self._q.Eval(context)))
-                if window[-1] > 0.0:  # The last reading was good, too.
-                    v_before = context.get_discrete_state(self._x).value()[V_TIP]
-                    with_force = input_with_force(
-                        u, v_before, x[V_TIP], mobility, self._tip_mass, self._dt
-                    )
-                observer = observe_force(
-                    observer,
-                    x[V_TIP],
-                    u / self._tip_mass,
-                    mobility,
-                    self._gain,
-                    self._dt,
-                )
-            else:  # It starts again with the next torque.
-                observer = np.append(observer[:-1], 0.0)
-            discrete_state.set_value(self._observer, observer)
-        else:
-            discrete_state.set_value(self._window, np.append(window[:-1], 0.0))
-        forces = context.get_discrete_state(self._with_force).value()[3:]
-        discrete_state.set_value(self._with_force, np.append(forces, with_force))

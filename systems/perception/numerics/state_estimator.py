@@ -6,6 +6,7 @@ import numpy as np
 from makebreak.systems.arm.numerics.serial_chain import chain_of, chain_state
 from makebreak.systems.contact_mpc.numerics.ball_state import (
     Q_BALL,
+    V_TIP,
     W_BALL,
     compiled_pack,
 )
@@ -30,16 +31,19 @@ def tip_motion(chain, q, v, torque, tip_mass):
         tip_mass: m [kg].
     Returns: p_tip (3,) [m], v_tip (3,) [m/s], u (3,) [N].
     """
-    state = chain_state(chain, q, v)
+    return _motion(chain_state(chain, q, v), v, torque, tip_mass)
+
+
+@numba.njit(cache=True)
+def _motion(state, v, torque, tip_mass):
     J = state.J[:3]
     a = J @ np.linalg.solve(state.M, torque - state.bias) + state.bias_a[:3]
     return state.p_WE, J @ v, tip_mass * a
 
 
 @numba.njit(cache=True)
-def tip_mobility(chain, q):
-    """J M^-1 J' (3, 3) of the tip's translation [1/kg] at q (n,)."""
-    state = chain_state(chain, q, np.zeros(q.shape[0]))
+def tip_mobility(state):
+    """J M^-1 J' (3, 3) of the tip's translation [1/kg] in a ChainState."""
     J = np.ascontiguousarray(state.J[:3])
     return J @ np.linalg.solve(state.M, np.ascontiguousarray(J.T))
 
@@ -82,48 +86,54 @@ def observe_force(observer, v_tip, a_free, mobility, gain, dt):
 
 
 @numba.njit(cache=True)
-def estimate(chain, q, v, torque, p_ball, v_ball, seen, tip_mass, radius, window):
-    """The state of the LCS from one set of readings, and the window of forces.
+def estimate(
+    chain, q, v, torque, p_ball, v_ball, seen, q_object, w_object, tip_mass, radius,
+    gain, dt, x, window, observer, with_force,
+):  # fmt: skip
+    """One update of StateEstimator from one set of readings.
 
     Args:
-        chain: SerialChain, packed (arm/numerics/packed.py). q, v, torque: as in
-            tip_motion.
+        chain: SerialChain of the arm with its tool, packed (arm/numerics/packed.py).
+        q, v, torque: as in tip_motion.
         p_ball, v_ball: (3,) [m], [m/s]. seen: (1,) above 0.5 if the ball is seen.
-        radius: of the modelled ball [m].
-        window: (3 n + 1,) the last n forces, oldest first [N], and the number of valid
-            readings in a row, at most n.
-    Returns: whether all readings but torque are finite (if not, ignore the rest);
-        whether torque is; x (19,); window, without a new force where torque is not
-        finite; valid: 1.0, or 0.0 if the ball is not seen, or -1.0 if not all but
-        torque are finite.
+        q_object (4,), w_object (3,) [rad/s]: of an object of known orientation; both
+            (0,): it is a rolling ball.
+        tip_mass: [kg]; radius: of the modelled ball [m]; gain, dt: of observe_force.
+        x (19,), window, observer (7,), with_force (3 n,): what the last update
+            returned. window (3 n + 1,): the last n forces, oldest first [N], and the
+            number of valid readings in a row, at most n. with_force: the last n of
+            input_with_force, not a number where it is unknown.
+    Returns: x, window, observer, with_force; valid: 1.0, or 0.0 if the object is not
+        seen, or -1.0 if a reading beside torque is not finite: then x and observer are
+        held.
     """
-    after = np.empty(window.size)
-    if not np.isfinite(q.sum() + v.sum() + p_ball.sum() + v_ball.sum()):
-        return False, False, after, after, -1.0
-    felt = np.isfinite(torque.sum())
-    p_tip, v_tip, u = tip_motion(
-        chain_of(chain), q, v, torque if felt else np.zeros(q.size), tip_mass
-    )
     n = window.size // 3
-    valid = 1.0 if seen[0] > 0.5 else 0.0
-    if felt:
-        after[: 3 * n - 3] = window[3 : 3 * n]
-        after[3 * n - 3 : 3 * n] = u
-        after[3 * n] = min(valid * (window[3 * n] + 1.0), n)
-    else:
-        after[:] = window
+    after, forces = window.copy(), np.empty(3 * n)
+    forces[:-3], forces[-3:] = with_force[3:], np.nan
+    numbers = q.sum() + v.sum() + p_ball.sum() + v_ball.sum()
+    turns = q_object.size > 0
+    if turns:
+        numbers += q_object.sum() + w_object.sum()
+    if not np.isfinite(numbers) or (turns and not np.sum(q_object**2) > 0.25):
         after[3 * n] = 0.0
-    x = compiled_pack(p_tip, v_tip, p_ball, v_ball, radius)
-    return True, felt, x, after, valid
-
-
-def with_pose(finite, x, valid, q_object, w_object):
-    """The results of `estimate` (without the window) for an object of known orientation
-    q_object (4,) and angular velocity w_object (3,) [rad/s], not a rolling ball."""
-    known = np.isfinite(q_object).all() and np.isfinite(w_object).all()
-    size = np.sqrt(q_object @ q_object)
-    if not (finite and known and size > 0.5):
-        return False, x, -1.0
-    x = x.copy()
-    x[Q_BALL], x[W_BALL] = q_object / size, w_object
-    return True, x, valid
+        return x.copy(), after, observer.copy(), forces, -1.0
+    valid = 1.0 if seen[0] > 0.5 else 0.0
+    felt = np.isfinite(torque.sum())
+    state = chain_state(chain_of(chain), q, v)
+    p_tip, v_tip, u = _motion(state, v, torque if felt else np.zeros(q.size), tip_mass)
+    x_now = compiled_pack(p_tip, v_tip, p_ball, v_ball, radius)
+    if turns:
+        x_now[Q_BALL], x_now[W_BALL] = q_object / np.sqrt(np.sum(q_object**2)), w_object
+    if not felt:  # The observer starts again with the next torque.
+        after[3 * n] = 0.0
+        observed = observer.copy()
+        observed[6] = 0.0
+        return x_now, after, observed, forces, valid
+    after[: 3 * n - 3] = window[3 : 3 * n]
+    after[3 * n - 3 : 3 * n] = u
+    after[3 * n] = min(valid * (window[3 * n] + 1.0), n)
+    mobility = tip_mobility(state)
+    if window[3 * n] > 0.0:  # The last reading was good, too.
+        forces[-3:] = input_with_force(u, x[V_TIP], v_tip, mobility, tip_mass, dt)
+    observed = observe_force(observer, v_tip, u / tip_mass, mobility, gain, dt)
+    return x_now, after, observed, forces, valid
