@@ -87,6 +87,7 @@ from makebreak.systems.changing_contact.numerics.contact_task import (
 from makebreak.systems.changing_contact.numerics.push_motion import (
     BALL_SEGMENT,
     DOWN,
+    N_FRAME,
     TABLE_SEGMENT,
 )
 from makebreak.systems.changing_contact.numerics.reference_blend import COMMAND
@@ -240,7 +241,8 @@ SIGNALS = {
     "trial": ("push_motion", "trial", 1),
     "active": ("push_motion", "active", 1),
     "ee_pose": ("tip_state", "ee_pose", 7),
-    "x_desired": ("reference_blend", "x_desired", 19),
+    "frame": ("push_motion", "frame", N_FRAME),
+    "shaped": ("velocity_shaper", "x_desired", 19),  # In that frame.
     "phase": ("velocity_shaper", "phase", 6),
     "contact": ("contact_detector", "contact", 14),
     "mode": ("mode_detector", "mode", 1),

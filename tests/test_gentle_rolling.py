@@ -348,7 +348,16 @@ def updates(diagram):
 def running():
     """The first landing, and half a second of counts before."""
     diagram = make_gentle_rolling(config())
-    simulator = Simulator(diagram)
+    simulator, reference = Simulator(diagram), []
+    blend = diagram.GetSubsystemByName("reference_blend")
+    own = blend.GetMyContextFromRoot(simulator.get_context())
+
+    def note(context):
+        tick = 1e3 * context.get_time()
+        if abs(tick - round(tick)) < 1e-6:  # What it is made of is held in between.
+            reference.append(blend.GetOutputPort("x_desired").Eval(own)[:3])
+
+    simulator.set_monitor(note)
     for system in diagram.GetSystems():
         if hasattr(system, "compute_sec"):
             system.compute_sec.clear()
@@ -356,6 +365,7 @@ def running():
     count = updates(diagram)
     simulator.AdvanceTo(3.2)
     return SimpleNamespace(
+        reference=np.array(reference),
         diagram=diagram,
         context=simulator.get_context(),
         count=count,
@@ -391,8 +401,8 @@ def test_the_first_landing_is_felt_where_the_ball_is_and_learned(running):
 
 
 def test_the_reference_never_steps(running):
-    x = running.said["x_desired"]
-    v = np.diff(x[:, :3], axis=0) / 1e-3
+    v = np.diff(running.reference, axis=0) / 1e-3
+    assert len(v) >= 3199
     # The fastest motion is some 0.4 m/s; a step of 1 mm would be 1 m/s.
     assert np.abs(v).max() < 0.6
 

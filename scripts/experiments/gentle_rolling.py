@@ -42,6 +42,7 @@ from makebreak.systems.changing_contact.numerics.push_motion import (
     BALL,
     TABLE,
     TABLE_SEGMENT,
+    frame_at,
 )
 
 SUMMARY = "a Panda rolls a ball with gentle contacts: all seven systems in one diagram"
@@ -198,7 +199,8 @@ def touches(said, believed, config, ball) -> dict:
             errors.append(abs(z - last[which]))
         last[which] = z
     sliding = active & (kind == TABLE) & (segment >= SLIDE)
-    error = said["x_desired"][:, :2] - said["ee_pose"][:, :2]
+    origin = frame_at(said["frame"].T, said["time"]).T
+    error = (origin + said["shaped"][:, :3] - said["ee_pose"][:, :3])[:, :2]
     mode = said["mode"][:, 0]
     pure, known = purity(mode, sliding, ~active & (kind == BALL))
 
