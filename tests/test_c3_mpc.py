@@ -81,7 +81,7 @@ from makebreak.systems.contact_mpc.numerics.lcs import (
     simulate,
 )
 from makebreak.systems.contact_mpc.numerics.orientation_cost import (
-    orientation_quadratic,
+    orientation_quadratics,
     squared_angle,
 )
 
@@ -1485,7 +1485,8 @@ def test_the_orientation_cost_has_the_gradient_and_hessian_of_the_angle(angle):
     axis *= angle / np.linalg.norm(axis)
     turned = Rotation.from_rotvec(axis) * goal
     q, q_d = turned.as_quat(scalar_first=True), goal.as_quat(scalar_first=True)
-    Q, target = orientation_quadratic(q, -q_d)  # The same orientation as q_d.
+    # The same orientation as q_d.
+    Q, target = (each[0] for each in orientation_quadratics(q, -q_d[None]))
     assert (q - target) @ Q @ (q - target) == pytest.approx(angle**2, abs=1e-9)
     assert np.linalg.eigvalsh(Q).min() > -1e-12
 
@@ -1525,7 +1526,7 @@ def test_a_turn_about_a_free_axis_costs_nothing(angle, rolled):
         a, b = x.apply(axis), goal.apply(axis)
         return np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b) ** 2
 
-    Q, target = orientation_quadratic(q, q_d, axis)
+    Q, target = (each[0] for each in orientation_quadratics(q, q_d[None], axis))
     assert (q - target) @ Q @ (q - target) == pytest.approx(angle**2, abs=1e-9)
     assert np.linalg.eigvalsh(Q).min() > -1e-12
     h = 1e-4

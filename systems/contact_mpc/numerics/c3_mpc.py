@@ -61,7 +61,7 @@ from makebreak.systems.contact_mpc.numerics.lcs import (
     simulate,
 )
 from makebreak.systems.contact_mpc.numerics.orientation_cost import (
-    orientation_quadratic,
+    orientation_quadratics,
     squared_angle,
 )
 
@@ -300,19 +300,18 @@ class C3Problem:
         Q_N = self.Q_N.copy()
         for o in self.orientation:
             of = slice(o.start, o.start + 4)
-            for k in range(N + 1):
-                whole = Q_N if k == N else Q[k]
-                for name, q in (("x0", x0[of]), (f"x_desired[{k}]", x_desired[k, of])):
-                    if not np.linalg.norm(q) > 0.5:
-                        raise C3Failure(
-                            f"{name}: the quaternion at {o.start} is {q}, expected a "
-                            "unit one"
-                        )
-                weight = o.weight if k < N or o.weight_N is None else o.weight_N
-                local, goal[k, of] = orientation_quadratic(
-                    x0[of], x_desired[k, of], o.free_axis
+            q = np.vstack([x0[of], x_desired[:, of]])
+            bad = np.flatnonzero(~((q**2).sum(axis=1) > 0.25))
+            if bad.size:
+                name = f"x_desired[{bad[0] - 1}]" if bad[0] else "x0"
+                raise C3Failure(
+                    f"{name}: the quaternion at {o.start} is {q[bad[0]]}, expected a "
+                    "unit one"
                 )
-                whole[of, of] += weight * local
+            local, goal[:, of] = orientation_quadratics(q[0], q[1:], o.free_axis)
+            Q[:, of, of] += o.weight * local[:N]
+            last = o.weight if o.weight_N is None else o.weight_N
+            Q_N[of, of] += last * local[N]
         for a in (Q, Q_N):
             a.setflags(write=False)  # To the compiler another type, like p.Q's.
         return Q, Q_N, goal

@@ -29,64 +29,73 @@ def squared_angle(q, q_desired, free_axis=None) -> float:
 
     Args: free_axis: (3,) of the body, a turn about which does not count; None: none.
     """
+    q_desired = np.asarray(q_desired)[None]
     if free_axis is not None:
         q_desired = _twisted(q, q_desired, free_axis)
-    return 4.0 * _arc(q, q_desired)[0] ** 2
+    return float(4.0 * _arcs(q, q_desired)[0][0] ** 2)
 
 
-def orientation_quadratic(q, q_desired, free_axis=None):
-    """Q (4, 4) and target (4,) with (x - target)' Q (x - target) equal to the squared
-    angle [rad^2] to second order in x about q, along the unit sphere; with a free axis
-    to first order, and to second along every direction but mixed ones with that turn.
+def orientation_quadratics(q, q_desired, free_axis=None):
+    """Q (n, 4, 4) and targets (n, 4) with (x - target)' Q (x - target) equal to the
+    squared angle [rad^2] to each of n orientations to second order in x about q, along
+    the unit sphere; with a free axis to first order, and to second along every
+    direction but mixed ones with that turn.
 
-    Args: q, q_desired: (4,) of any length but zero; free_axis: as of squared_angle.
+    Args: q (4,), q_desired (n, 4), of any length but zero; free_axis: as of
+        squared_angle.
     """
     if free_axis is not None:
-        Q, target = orientation_quadratic(q, _twisted(q, q_desired, free_axis))
-        t = _product(q / np.linalg.norm(q), np.array([0.0, *_unit(free_axis)]))
-        P = np.eye(4) - np.outer(t, t)
-        return P @ Q @ P, target
-    phi, q, e = _arc(q, q_desired)
-    across = phi / np.tan(phi) if phi > 1e-4 else 1.0 - phi * phi / 3.0
-    along = np.outer(e, e)
+        q_desired = _twisted(q, q_desired, free_axis)
+    phi, q, e = _arcs(q, q_desired)
+    near = phi < 1e-4
+    across = np.where(near, 1.0 - phi**2 / 3.0, phi / np.tan(np.where(near, 1.0, phi)))
+    along = e[:, :, None] * e[:, None]
     rest = np.eye(4) - np.outer(q, q) - along
-    return 4.0 * (along + across * rest), q - phi * e
+    Q = 4.0 * (along + across[:, None, None] * rest)
+    if free_axis is not None:
+        t = _products(q[None], np.array([[0.0, *_unit(free_axis)]]))
+        P = np.eye(4) - t.T @ t
+        Q = P @ Q @ P
+    return Q, q - phi[:, None] * e
 
 
-def _unit(axis):
-    axis = np.asarray(axis, dtype=float)
-    return axis / np.linalg.norm(axis)
+def _unit(a):
+    a = np.asarray(a, dtype=float)
+    return a / np.linalg.norm(a, axis=-1, keepdims=True)
 
 
-def _product(a, b):
-    """Of two quaternions (4,)."""
-    w, v = a[0], a[1:]
-    return np.array(
-        [w * b[0] - v @ b[1:], *(w * b[1:] + b[0] * v + np.cross(v, b[1:]))]
-    )
+def _products(a, b):
+    """Of quaternions (n, 4), each with each."""
+    (w, v), (w_b, v_b) = ((x[:, :1], x[:, 1:]) for x in (a, b))
+    return np.hstack([
+        w * w_b - (v * v_b).sum(axis=1, keepdims=True),
+        w * v_b + w_b * v + np.cross(v, v_b),
+    ])  # fmt: skip
 
 
 def _twisted(q, q_desired, axis):
-    """q_desired, turned about an axis (3,) of the body to where it is nearest to q."""
-    axis = _unit(axis)
-    goal = q_desired / np.linalg.norm(q_desired)
+    """q_desired (n, 4), turned about an axis (3,) of the body to where it is nearest to
+    q (4,)."""
+    axis, goal = _unit(axis), _unit(q_desired)
     # goal^-1 q: its part about the axis is the turn.
-    away = _product(np.array([goal[0], *-goal[1:]]), q / np.linalg.norm(q))
-    turn = np.array([away[0], *(away[1:] @ axis * axis)])
-    size = np.linalg.norm(turn)
-    return goal if size < 1e-12 else _product(goal, turn / size)
+    away = _products(goal * [1.0, -1.0, -1.0, -1.0], _unit(q)[None])
+    turn = np.hstack([away[:, :1], (away[:, 1:] @ axis)[:, None] * axis])
+    size = np.linalg.norm(turn, axis=1, keepdims=True)
+    turn = np.where(size < 1e-12, [1.0, 0.0, 0.0, 0.0], turn / np.maximum(size, 1e-12))
+    return _products(goal, turn)
 
 
-def _arc(q, q_desired):
-    """phi, the unit q, and the unit tangent at q away from q_desired."""
-    q = q / np.linalg.norm(q)
-    goal = q_desired / np.linalg.norm(q_desired)
-    if q @ goal < 0.0:
-        goal = -goal
-    away = (q @ goal) * q - goal  # Of length sin(phi).
-    sine = np.linalg.norm(away)
-    if sine > 0.0:
-        return np.arctan2(sine, q @ goal), q, away / sine
+def _arcs(q, q_desired):
+    """phi (n,), the unit q (4,), and the unit tangents (n, 4) at q away from q_desired
+    (n, 4)."""
+    q, goal = _unit(q), _unit(q_desired)
+    cosine = goal @ q
+    goal = np.where(cosine < 0.0, -1.0, 1.0)[:, None] * goal
+    cosine = np.abs(cosine)
+    away = cosine[:, None] * q - goal  # Of length sin(phi).
+    sine = np.linalg.norm(away, axis=1)
     tangent = np.eye(4)[np.argmin(np.abs(q))]  # At the goal every direction is alike.
-    tangent = tangent - (q @ tangent) * q
-    return 0.0, q, tangent / np.linalg.norm(tangent)
+    tangent = _unit(tangent - (q @ tangent) * q)
+    there = sine == 0.0
+    e = np.where(there[:, None], tangent, away / np.where(there, 1.0, sine)[:, None])
+    return np.arctan2(sine, cosine), q, e
