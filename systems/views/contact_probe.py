@@ -78,7 +78,8 @@ class ContactLoad(LeafSystem):
 
     def _calc(self, context: Context, output: BasicVector):
         load = np.zeros(2)
-        if self._torque.HasValue(context) and not self._torque.Eval(context).any():
+        read = self._torque.HasValue(context)
+        if read and not np.count_nonzero(self._torque.Eval(context)):
             output.SetFromVector(load)
             return
         results = self._results.Eval(context)
