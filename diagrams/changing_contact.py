@@ -195,12 +195,12 @@ def tip_mass(arm: MultibodyPlant):
     return mass
 
 
-# Signals of `telemetry`: name -> (system, port, size).
+# Signals of `telemetry`: name -> (system, port, size); no more than what is scored, as
+# some are computed for it alone each millisecond.
 SIGNALS = {
     "ee_pose": ("tip_state", "ee_pose", 7),
     "ee_velocity": ("tip_state", "ee_velocity", 6),
     "wrench": ("station", f"{ARM}.external_wrench", 6),
-    "contact_force": ("station", f"{TOOL}.contact_force", 3),
     "tip_true": ("station", f"{TOOL}.tip_position", 3),
     "x_desired": ("velocity_shaper", "x_desired", 19),
     "direction": ("velocity_shaper", "direction", 3),
@@ -211,13 +211,9 @@ SIGNALS = {
     "mode": ("mode_detector", "mode", 1),
     "confidence": ("mode_detector", "confidence", 2),
     "collecting": ("mode_detector", "collecting", 1),
-    "wrench_predicted": ("forward_model_bank", "wrench_predicted", 6),
-    "prediction_error": ("forward_model_bank", "prediction_error", 1),
-    "approach_speed": ("contact_anticipator", "approach_speed", 1),
     "stiffness": ("variable_impedance", "stiffness", 6),
     "wrench_feedforward": ("variable_impedance", "wrench_feedforward", 6),
     "tau": ("impedance_controller", "tau", 7),
-    "status": ("impedance_controller", "status", 1),
 }
 
 
