@@ -392,23 +392,25 @@ def combinations(repeats: int):
             weights = C3Weights(p.Q, p.R, _widened(p.G, lcs), _widened(p.U, lcs))
             problem = C3Problem(weights, p.projection, p.options)
             what = f"{'C3+' if plus else 'C3'}, ball, N 10, {name}, n_lam {lcs.n_lam}"
-            try:
-                u = solve_c3(lcs, x0, x_desired, problem)[0].u
-            except C3Failure as error:  # Not convex: docs/c3.md.
-                found.append({"what": what, "value": None, "failure": str(error)})
-                continue
-            ms = median_call_ms(partial(solve_c3, lcs, x0, x_desired, problem), repeats)
             as_real = C3Problem(
                 C3Weights(p.Q, p.R, _widened(p.G, real), _widened(p.U, real)),
                 p.projection,
                 p.options,
             )
+            try:
+                u = solve_c3(lcs, x0, x_desired, problem)[0].u
+                cost = plan_cost(real, x0, u, x_desired, as_real)
+            except (C3Failure, ValueError) as error:
+                # Not convex (docs/c3.md), or not to be rolled out.
+                found.append({"what": what, "value": None, "failure": str(error)})
+                continue
+            ms = median_call_ms(partial(solve_c3, lcs, x0, x_desired, problem), repeats)
             found.append(
                 {
                     "what": what,
                     "value": ms,
                     "unit": "ms",
-                    "cost": plan_cost(real, x0, u, x_desired, as_real),
+                    "cost": cost,
                 }
             )
     return found
