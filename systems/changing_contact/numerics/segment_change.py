@@ -133,7 +133,7 @@ def handle_events(table, m, law, t, contact, pose):
     if m.held > 0.0 or m.ended > 0.0 or not (made or broken):
         return
     k = int(m.now.segment)
-    X, s, _ = reference(table, m, t)
+    X, s, _, _ = reference(table, m, t)
     if made:
         tangent = path_point(table, k, s)[1, :3]
         # Else an echo of the last.
@@ -171,5 +171,5 @@ def watch_lost(table, m, t, pose):
             m.lost_time[row] = 0.0
         elif dot(n, pose) - m.lost_at[row] > LOST_WAY:
             m.lost_time[row], m.off[row] = 0.0, 1.0
-            X, _, _ = reference(table, m, t)
+            X, _, _, _ = reference(table, m, t)
             add_along(m.c, n, dot(n, pose) - dot(n, X[0]))

@@ -19,10 +19,12 @@ TURN_BACK_SEC = 1.0  # Fading time of an orientation where positions stay shifte
 
 @numba.njit(cache=True)
 def reference(table, m, t):
-    """X and its two time derivatives (3, 6) at time t, and s, v along the path."""
+    """X and its two time derivatives (3, 6) at time t; s, v along the path, and the
+    path's tangent (6,) there."""
     out = np.zeros((3, 6))
     s, v, a = motion_at(m.now, t)
     D = path_point(table, int(m.now.segment), s)
+    tangent = D[1].copy()
     for i in range(6):
         out[0, i] = m.c[i] + D[0, i]
         out[1, i] = D[1, i] * v
@@ -46,7 +48,7 @@ def reference(table, m, t):
                 out[0, i] += fade.X[i] * (1.0 - S)
                 out[1, i] -= fade.X[i] * slope / T
                 out[2, i] -= fade.X[i] * bend / (T * T)
-    return out, s, v
+    return out, s, v, tangent
 
 
 @numba.njit(cache=True)

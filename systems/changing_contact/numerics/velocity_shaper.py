@@ -140,11 +140,11 @@ def tick(table, law, regions, memory, t, contact, pose):
     elif m.held > 0.0 or bad:
         stage = HOLD
 
-    X, s, v = reference(table, m, t)
+    X, s, v, along = reference(table, m, t)
     k = int(m.now.segment)
     tangent = np.zeros(3)
     if v > AT_REST or m.now.target > 0.0:
-        tangent[:] = path_point(table, k, s)[1, :3]
+        tangent[:] = along[:3]
     directions, targets = np.zeros(6), np.zeros(2)
     for row in range(int(head(table, k, N_FORCE))):
         if m.off[row] == 0.0:
@@ -179,13 +179,13 @@ def _end_segment(table, m, law, t, pose):
     at_rest = m.now.target == 0.0 and m.now.n_steps == 0.0
     if head(table, k, GOES_ON) > 0.0:
         if s >= L + law.search_max * head(table, k, IN_LOSS):
-            X, _, _ = reference(table, m, t)
+            X, _, _, _ = reference(table, m, t)
             go_on(table, m, law, t, pose, X[0])
     elif at_rest and s >= L - NEAR:
         if k + 1 >= table[0]:  # The last one.
             m.ended = 1.0
         else:
-            X, _, _ = reference(table, m, t)
+            X, _, _, _ = reference(table, m, t)
             change_segment(table, m, law, t, pose, X[0], s, 0.0)
             start_track(m.now, t, k + 1.0, 0.0)
 
@@ -225,7 +225,7 @@ def take_over(table, law, contact, t, old_table, old_memory):
     Returns: its memory, and how long the blend from the old one takes [s]: blend_sec,
         or longer, so that what the blend adds stays about within a_max.
     """
-    X, _, _ = reference(old_table, old_memory.view(MEMORY)[0], t)
+    X, _, _, _ = reference(old_table, old_memory.view(MEMORY)[0], t)
     L, n = head(table, 0, LENGTH), LOOKED_AT
     s, nearest = 0.0, np.inf
     for i in range(n + 1):
