@@ -157,7 +157,9 @@ def replace(memory: ModeMemory, **changes) -> ModeMemory:
     """As dataclasses.replace, whose call of the constructor takes ten times as long."""
     new = object.__new__(ModeMemory)
     vars(new).update(vars(memory), **changes)
-    new.__post_init__()
+    for value in changes.values():
+        if isinstance(value, np.ndarray):
+            value.setflags(write=False)
     return new
 
 
