@@ -13,6 +13,7 @@ from xml.dom import expatbuilder, minidom
 from xml.etree import ElementTree as ET
 
 import numpy as np
+from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
     Joint,
@@ -64,7 +65,7 @@ def to_mjcf(scene: Scene) -> Exported:
     """The joints, inertias, motors and servos of a scene as MJCF, without shapes, so
     without contact.
 
-    Raises: ValueError unless all joints are revolute, prismatic or fixed.
+    Raises: ValueError for joints other than revolute, prismatic, fixed and free.
     """
     loaded = _load(scene)
     plant = loaded.plant
@@ -88,7 +89,9 @@ def to_mjcf(scene: Scene) -> Exported:
             raise ValueError("the scene's joints form a loop, which MJCF cannot say so")
         for joint in ready:
             body = joint.child_body()
-            attributes = {"name": full_name(plant, body), **_pose(joint)}
+            is_free = body.is_floating_base_body()
+            name = full_name(plant, body)
+            attributes = {"name": name, **_at(_pose(joint, is_free))}
             parent = elements[joint.parent_body().index()]
             at = ET.SubElement(parent, "body", attributes)
             elements[body.index()] = at
@@ -99,13 +102,18 @@ def to_mjcf(scene: Scene) -> Exported:
                     at, "inertial", pos=_numbers(inertial.com),
                     mass=repr(inertial.mass), fullinertia=_numbers(six),
                 )  # fmt: skip
-            if not isinstance(joint, WeldJoint):
+            if is_free:
+                ET.SubElement(at, "freejoint", name=name)
+            elif not isinstance(joint, WeldJoint):
                 _mjcf_joint(loaded, joint, at, motors)
         todo = [j for j in todo if j.child_body().index() not in elements]
     if len(motors):
         root.append(motors)
     ET.indent(root)
+    free = [full_name(plant, plant.get_body(i)) for i in plant.GetFloatingBaseBodies()]
     stands = tuple(f"motion of joint {name}" for name in scene.fixed_joints)
+    if free:
+        stands += (f"shapes, so nothing holds {', '.join(sorted(free))}",)
     text = ET.tostring(root, encoding="unicode") + "\n"
     return Exported(text, _unsaid(scene) + stands)
 
@@ -138,6 +146,7 @@ def to_sdf(scene: Scene, model: str) -> Exported:
     plant = plain.plant
     instance = plant.GetModelInstanceByName(model)
     joints = [plant.get_joint(i) for i in plant.GetJointIndices(instance)]
+    joints = [j for j in joints if not j.child_body().is_floating_base_body()]
     welded = {
         each.add_weld.child.partition("::")[0]
         for each in scene.directives
@@ -214,7 +223,7 @@ def formats_of(scene: Scene) -> list[str]:
     """Of urdf, sdf and mjcf those in which the scene's mechanism can be written."""
     try:
         _load(scene)
-    except ValueError:  # It has a body that moves freely.
+    except ValueError:  # It has other joints.
         return []
     files = robot_files(scene).values()
     is_urdf = any(file.suffix == ".urdf" for file in files)
@@ -224,20 +233,16 @@ def formats_of(scene: Scene) -> list[str]:
 def _load(scene: Scene) -> LoadedScene:
     loaded = load_scene(scene, DiagramBuilder())
     plant = loaded.plant
-    free = [
-        full_name(plant, plant.get_body(i))
-        for i in sorted(plant.GetFloatingBaseBodies())
-    ]
     others = [
         full_name(plant, joint)
         for joint in (plant.get_joint(i) for i in plant.GetJointIndices())
         if not isinstance(joint, (RevoluteJoint, PrismaticJoint, WeldJoint))
-        and full_name(plant, joint.child_body()) not in free
+        and not joint.child_body().is_floating_base_body()
     ]
-    if free or others:
+    if others:
         raise ValueError(
-            f"{', '.join([*free, *others])}: only mechanisms of joints that turn or "
-            "slide are written as URDF, SDF and MJCF"
+            f"{', '.join(others)}: only joints that turn or slide, and bodies that "
+            "move freely, are written as URDF, SDF and MJCF"
         )
     return loaded
 
@@ -276,16 +281,22 @@ def _numbers(values: Sequence[float] | np.ndarray) -> str:
     return " ".join(repr(float(x)) for x in values)
 
 
-def _pose(joint: Joint) -> dict[str, str]:
-    """Pose of the child in its parent at the joint's zero, as MJCF attributes."""
+def _pose(joint: Joint, is_free: bool) -> RigidTransform:
+    """Pose of the child in its parent at the joint's zero; of a free one where it
+    starts."""
+    if is_free:
+        body = joint.child_body()
+        return body.GetParentPlant().GetDefaultFloatingBaseBodyPose(body)
     X_PF = joint.frame_on_parent().GetFixedPoseInBodyFrame()
     X_BM = joint.frame_on_child().GetFixedPoseInBodyFrame()
     X_PM = X_PF @ joint.X_FM() if isinstance(joint, WeldJoint) else X_PF
-    X_PB = X_PM @ X_BM.inverse()
-    return {
-        "pos": _numbers(X_PB.translation()),
-        "quat": _numbers(X_PB.rotation().ToQuaternion().wxyz()),
-    }
+    return X_PM @ X_BM.inverse()
+
+
+def _at(X: RigidTransform) -> dict[str, str]:
+    """A pose as MJCF attributes."""
+    quat = X.rotation().ToQuaternion().wxyz()
+    return {"pos": _numbers(X.translation()), "quat": _numbers(quat)}
 
 
 def _mjcf_joint(loaded: LoadedScene, joint: Joint, body, motors) -> None:

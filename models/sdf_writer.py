@@ -67,6 +67,8 @@ def sdf_of(
             if isinstance(joint, WeldJoint):
                 X_MB = joint.X_FM() @ X_MB
             _pose(link, X_MB, names[joint.name()])
+        elif body.is_floating_base_body():
+            _pose(link, plant.GetDefaultFloatingBaseBodyPose(body))
         _inertial(link, body)
         if not _shapes(link, plant, inspector, body):
             lost.append(f"{body.name()} has a half space")

@@ -1,6 +1,7 @@
 """A repaired scene as MJCF and URDF: the same mechanism in MuJoCo and in Drake."""
 
 import copy
+import re
 import sys
 import types
 from dataclasses import replace
@@ -10,7 +11,10 @@ import mujoco
 import numpy as np
 import pytest
 from effect_scenes import at_rest_but, double, on_ground, pendulum, with_effects
+from pydrake.common.eigen_geometry import Quaternion
 from pydrake.geometry import GeometrySet, Role
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.math import SpatialVelocity
 from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.gap.simulation.commands import Commands
@@ -297,6 +301,8 @@ mass=".7"/></body><body name="twin" pos="0 0 .3"><joint name="turn" axis="0 1 0"
 <equality><joint joint1="turn" joint2="slide" polycoef=".2 3 0 0 0"/></equality>
 <actuator><position joint="yaw" kp="50" kv="4" forcerange="-25 25"/></actuator>
 </mujoco>"""
+# The same with joints that nothing ties together, and without a rotor.
+LOOSE = re.sub(r'<equality>[\s\S]*</equality>|armature=".02"', "", CRANE)
 
 
 def shapes(scene_graph, context):
@@ -402,6 +408,74 @@ def test_a_urdf_is_written_of_a_xacro(tmp_path):
     assert masses == [1.5, 2.5]
 
 
+@pytest.mark.parametrize("which", ["urdf", "mjcf"])
+def test_a_robot_that_stands_on_nothing_is_free_in_what_is_written(tmp_path, which):
+    """Its energies are those of the scene, in MuJoCo and of the SDF in Drake."""
+    base = double(tmp_path)
+    base.directives.pop()  # Welded to nothing.
+    file, body, joint = tmp_path / "robot.urdf", "base", "fore"
+    text = GRIPPER.replace(
+        '<link name="base"/>',
+        '<link name="base"><inertial><origin xyz="0 .02 .1"/><mass value="3"/><inertia '
+        'ixx=".1" iyy=".2" izz=".2" ixy=".01" ixz="0" iyz="0"/></inertial></link>',
+    ).replace('<mimic joint="left" multiplier="0.5"\noffset="0.01"/>', "")
+    if which == "mjcf":
+        file, joint = tmp_path / "robot.xml", "yaw"
+        text = LOOSE.replace('pos="0 0 .1">', 'pos="0 0 .1"><freejoint/>', 1)
+    file.write_text(text)
+    base.directives[0].add_model.file = f"file://{file}"
+    load = ("payload", f"d.{body}", dict(mass=0.4, com_x=0.05, com_y=0.01, com_z=-0.04))
+    actuation = ActuationSection(type="effort", joints=[f"d.{joint}"])
+    scene = with_effects(replace(base, actuation=actuation), load)
+    texts = exported(scene, ["mjcf", "sdf"])
+    assert "shapes, so nothing holds d.base" in texts["repaired.xml"]
+    model, data = in_mujoco(texts["repaired.xml"])
+    start = [0.0, 0.0, 0.1 if which == "mjcf" else 0.0]
+    np.testing.assert_allclose(model.body("d.base").pos, start)
+    (tmp_path / "again.sdf").write_text(texts["d.sdf"])
+    again = replace(copy.deepcopy(base), actuation=ActuationSection(type="none"))
+    again.directives[0].add_model.file = f"file://{tmp_path / 'again.sdf'}"
+    plants = [load_scene(each, DiagramBuilder()).plant for each in (scene, again)]
+    for each in plants:
+        pose = each.GetDefaultFloatingBaseBodyPose(each.GetBodyByName("base"))
+        np.testing.assert_allclose(pose.translation(), start)
+    rng, heights = np.random.default_rng(0), []
+    for _ in range(4):
+        quat, p, w, v = (rng.normal(size=n) for n in (4, 3, 3, 3))
+        X = RigidTransform(RotationMatrix(Quaternion(quat / np.linalg.norm(quat))), p)
+        angles, rates = rng.uniform(-1, 1, (2, model.njnt - 1))
+        names = [model.joint(i).name.partition(".")[2] for i in range(1, model.njnt)]
+        energies = []
+        for plant in plants:
+            context = plant.CreateDefaultContext()
+            own = plant.GetBodyByName(body)
+            plant.SetFreeBodyPose(context, own, X)
+            plant.SetFreeBodySpatialVelocity(context, own, SpatialVelocity(w, v))
+            for name, q, rate in zip(names, angles, rates, strict=True):
+                there = name if plant.HasJointNamed(name) else f"{name}_joint"
+                one = plant.GetJointByName(there)
+                turns = one.type_name() == "revolute"
+                (one.set_angle if turns else one.set_translation)(context, q)
+                rated = one.set_angular_rate if turns else one.set_translation_rate
+                rated(context, rate)
+            energies.append(
+                [plant.CalcKineticEnergy(context), plant.CalcPotentialEnergy(context)]
+            )
+        data.qpos[:] = [*p, *X.rotation().ToQuaternion().wxyz(), *angles]
+        data.qvel[:] = [*v, *(X.rotation().inverse() @ w), *rates]
+        mujoco.mj_forward(model, data)
+        momentum = np.zeros(model.nv)
+        mujoco.mj_mulM(model, data, momentum, data.qvel)
+        mujoco.mj_energyPos(model, data)
+        energies.append([0.5 * data.qvel @ momentum, data.energy[0]])
+        kinetic, potential = np.transpose(energies)
+        np.testing.assert_allclose(kinetic, kinetic[0], rtol=1e-9)
+        heights.append(potential)
+    # Potential energies may differ by a constant.
+    change = np.diff(heights, axis=0)
+    np.testing.assert_allclose(change, np.tile(change[:, :1], 3), rtol=1e-9)
+
+
 def test_what_a_format_cannot_say_is_told(tmp_path):
     scene = with_effects(double(tmp_path), *SAID, LOST)
     (said,) = to_mjcf(scene).omitted
@@ -409,8 +483,15 @@ def test_what_a_format_cannot_say_is_told(tmp_path):
     # The double pendulum's file has no transmissions to write rotors to.
     omitted = to_urdf(scene, "d").omitted
     assert [("rotor" in each) for each in omitted] == [False, True, True]
-    with pytest.raises(ValueError, match="b.box: only mechanisms"):
-        to_mjcf(on_ground(tmp_path, "cube"))
+    (tmp_path / "ball.xml").write_text(
+        LOOSE.replace('type="slide"', 'type="ball"').replace('range="0 .3" ', "")
+    )
+    scene.directives[:] = scene.directives[:1]
+    scene.directives[0].add_model.file = f"file://{tmp_path / 'ball.xml'}"
+    other = replace(scene, effects=[], actuation=ActuationSection(type="none"))
+    with pytest.raises(ValueError, match="d.slide: only joints that turn or slide"):
+        to_mjcf(other)
+    assert formats_of(other) == []
     for write in (to_urdf, to_sdf):
         with pytest.raises(ValueError, match="'q' comes from no URDF"):
             write(scene, "q")
@@ -424,7 +505,7 @@ def test_what_is_offered_can_be_written(tmp_path):
     scene.directives[0].add_model.file = f"file://{tmp_path / 'd.sdf'}"
     assert formats_of(scene) == ["sdf", "mjcf"]
     assert exported(scene, formats_of(scene))
-    assert formats_of(on_ground(tmp_path, "cube")) == []
+    assert formats_of(on_ground(tmp_path, "cube")) == ["sdf", "mjcf"]
 
 
 def test_the_command_writes_what_is_asked_for(tmp_path):
