@@ -115,7 +115,7 @@ def to_mjcf(scene: Scene) -> Exported:
     if free:
         stands += (f"shapes, so nothing holds {', '.join(sorted(free))}",)
     text = ET.tostring(root, encoding="unicode") + "\n"
-    return Exported(text, _unsaid(scene) + stands)
+    return Exported(text, unsaid(scene.effects) + stands)
 
 
 def to_urdf(scene: Scene, model: str) -> Exported:
@@ -209,7 +209,7 @@ def _with_numbers(
             else:
                 inertia.appendChild(document.createElement("ixx"))
         write_inertial(link, inertial)
-    omitted = list(_unsaid(scene))
+    omitted = list(unsaid(scene.effects))
     for index in plant.GetJointIndices(instance):
         joint = plant.get_joint(index)
         if isinstance(joint, (RevoluteJoint, PrismaticJoint)):
@@ -438,7 +438,7 @@ def to_isaac_lab(scene: Scene) -> Exported:
         for name in ("min_delay", "max_delay"):
             text += f"        {name}=round({delay!r} / PHYSICS_DT),\n"
         text += "    ),\n"
-    return Exported(text + "}\n", _unsaid(scene, ("delay",)))
+    return Exported(text + "}\n", unsaid(scene.effects, ("delay",)))
 
 
 def _file_joint(loaded: LoadedScene, joint: Joint, document, there: str) -> list[str]:
@@ -518,11 +518,12 @@ def _kp(loaded: LoadedScene, joint: str, kp: float) -> float:
     return kp
 
 
-def _unsaid(scene: Scene, more: Sequence[str] = ()) -> tuple[str, ...]:
-    """Sentences of the effects that are not said; more: attributes that a format has
-    besides those of all."""
-    return tuple(
-        sentence(effect, KINDS[effect.kind])
-        for effect in scene.effects
-        if KINDS[effect.kind].exported not in ("inertia", "friction", "kp", *more)
-    )
+def is_said(effect: Effect, more: Sequence[str] = ()) -> bool:
+    """Whether a format has it; more: attributes that this one has besides those of
+    all."""
+    return KINDS[effect.kind].exported in ("inertia", "friction", "kp", *more)
+
+
+def unsaid(effects: Sequence[Effect], more: Sequence[str] = ()) -> tuple[str, ...]:
+    """Sentences of the effects that are not said."""
+    return tuple(sentence(e, KINDS[e.kind]) for e in effects if not is_said(e, more))

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
+from xml.dom import expatbuilder, minidom
 
 import numpy as np
 from pydrake.geometry import (
@@ -49,11 +50,16 @@ from makebreak.models.effects.kind import (
     model_of,
     one_dof_joints,
 )
+from makebreak.models.effects.model_text import make_mesh_paths_absolute
 from makebreak.models.mjcf import named_spec, rotation
 from makebreak.models.model_export import (
+    Exported,
+    JointNumbers,
     inertial_of,
+    is_said,
     joint_numbers,
     payloads_of,
+    unsaid,
 )
 from makebreak.models.model_files import with_what_files_say
 from makebreak.models.robot_file import path_of
@@ -83,7 +89,7 @@ class MujocoTwin:
         place for; or where MuJoCo is missing.
     """
 
-    def __init__(self, scene: Scene):
+    def __init__(self, scene: Scene, for_export: bool = False):
         models = [d.add_model for d in scene.directives if d.add_model is not None]
         packages = PackageMap()
         for name, folder in scene.packages.items():
@@ -94,12 +100,15 @@ class MujocoTwin:
         if path is None or path.suffix != ".xml" or scene.fixed_joints:
             raise ValueError("MuJoCo simulates scenes of one MJCF file alone")
         self._spec, self._writer = named_spec(path)
-        self._spec.compiler.discardvisual = True  # Meshes are not made again.
+        self._path = path
         self._file = with_what_files_say(replace(scene, effects=[]))
         self._of_file = {e.key for e in self._file.effects}
         self._plain = _Numbers(load_scene(self._file, DiagramBuilder()))
         self._made: dict[tuple, Twin] = {}
         self._free_bodies()
+        if for_export:  # Of everything that the file has.
+            return
+        self._spec.compiler.discardvisual = True  # Meshes are not made again.
         self._drives_of(scene)
 
     def _free_bodies(self) -> None:
@@ -157,6 +166,11 @@ class MujocoTwin:
                 or e.kind in CONTACT_LAW
             ):  # fmt: skip
                 raise ValueError(f"MuJoCo has no place for {e.kind}")
+        spec, now = self._with_numbers(effects)
+        commands = self._set_drives(spec, now.loaded, effects)
+        return _indexed(spec.compile(), now.loaded.plant, commands)
+
+    def _with_numbers(self, effects: Sequence[Effect]):
         scene = replace(self._file, effects=list(effects))
         now = _Numbers(load_scene(scene, DiagramBuilder()))
         spec = self._spec.copy()
@@ -170,8 +184,33 @@ class MujocoTwin:
         self._set_inertias(spec, now)
         self._set_shapes(spec, now)
         self._set_pairs(spec, effects)
-        commands = self._set_drives(spec, now.loaded, effects)
-        return _indexed(spec.compile(), now.loaded.plant, commands)
+        return spec, now
+
+    def exported(self, effects: Sequence[Effect]) -> Exported:
+        """The file with these effects, and with the gains of the scene's servos in the
+        places of its own; what actuators have no place for is told."""
+        said = [e for e in effects if is_said(e) or e.key in self._of_file]
+        spec, now = self._with_numbers(said)
+        omitted = [*unsaid([e for e in effects if e.key not in self._of_file])]
+        for joint in one_dof_joints(now.loaded.plant):
+            drive = joint_numbers(now.loaded, joint)
+            if drive.is_driven and not _set_servo(spec, joint.name(), drive):
+                omitted.append(
+                    f"{full_name(now.loaded.plant, joint)} is driven with kp "
+                    f"{drive.kp:.4g} and kd {drive.kd:.4g}"
+                )
+        spec.compile()
+        document = expatbuilder.parseString(spec.to_xml().encode(), namespaces=False)
+        (compiler,) = document.getElementsByTagName("compiler")[:1]
+        for key in ("meshdir", "texturedir"):
+            if not compiler.hasAttribute(key):
+                compiler.setAttribute(key, ".")
+        make_mesh_paths_absolute(document, self._path.parent)
+        for each in document.getElementsByTagName("general"):
+            _name_servo(each)
+        root = document.documentElement
+        assert root is not None  # Of what MuJoCo writes.
+        return Exported(root.toxml() + "\n", tuple(omitted))
 
     def _set_inertias(self, spec, now: "_Numbers") -> None:
         every = int(spec.compiler.inertiafromgeom) == 1  # They would win.
@@ -259,6 +298,64 @@ class MujocoTwin:
                 if what in takes:
                     commands[f"{name}.{what}"] = (k, gain * factor)
         return commands
+
+
+def own_mjcf(scene: Scene) -> Exported | None:
+    """The scene's own MJCF with its repaired numbers: shapes, meshes, contacts, sensors
+    and names are those of the file. None of a scene that is not one MJCF file, or that
+    MuJoCo does not hold as its file has it."""
+    try:
+        # What the file lets move, as a gripper's fingers, moves in what is written.
+        twin = MujocoTwin(replace(scene, fixed_joints={}), for_export=True)
+        return twin.exported(scene.effects)
+    except ValueError:
+        return None
+
+
+def _set_servo(spec, joint: str, drive: JointNumbers) -> bool:
+    """Sets the gains of the joint's own servo. Whether nothing is lost of the drive:
+    what takes efforts has no gains."""
+    import mujoco
+
+    if not (drive.kp or drive.kd):
+        return True
+    own = [
+        a for a in spec.actuators
+        if a.trntype == mujoco.mjtTrn.mjTRN_JOINT and a.target == joint
+    ]  # fmt: skip
+    if len(drive.takes) != 1 or len(own) != 1:
+        return False
+    if own[0].biastype != mujoco.mjtBias.mjBIAS_AFFINE:
+        return False
+    (servo,), by = own, own[0].gear[0] ** 2
+    if bool(servo.biasprm[1]) != bool(drive.kp):
+        return False  # Of a velocity, where the drive is of a position.
+    servo.gainprm[0] = (drive.kp or drive.kd) / by
+    servo.biasprm[:3] = 0.0, -drive.kp / by, -drive.kd / by
+    if np.isfinite(drive.limit):
+        servo.forcelimited, most = 1, drive.limit / abs(servo.gear[0])
+        servo.forcerange = [-most, most]
+    return True
+
+
+def _name_servo(general: minidom.Element) -> None:
+    """MuJoCo writes its servos as what they are made of; people, and its versions
+    before 4, know them by their names."""
+    gain, bias = (general.getAttribute(k).split() for k in ("gainprm", "biasprm"))
+    if len(gain) != 1 or len(bias) != 3 or general.getAttribute("dyntype"):
+        return
+    g, (b0, b1, b2) = float(gain[0]), map(float, bias)
+    if b0 == 0.0 and b1 == -g:
+        general.tagName, gains = "position", {"kp": g, "kv": -b2}
+    elif b0 == b1 == 0.0 and b2 == -g:
+        general.tagName, gains = "velocity", {"kv": g}
+    else:
+        return
+    for key in ("gainprm", "biasprm", "biastype", "input"):
+        if general.hasAttribute(key):
+            general.removeAttribute(key)
+    for key, value in gains.items():
+        general.setAttribute(key, f"{value:.6g}")
 
 
 class _Numbers:

@@ -345,7 +345,9 @@ def test_sdf_that_is_made_of_another_file_moves_as_the_scene(tmp_path, which):
     two = "d.right" if which == "urdf" else "d.turn"
     still = replace(scene, fixed_joints={one: 0.01, two: 0.02})
     text = exported(still, ["sdf"])["d.sdf"]
-    assert f"motion of joint {one}" in exported(still, ["mjcf"])["repaired.xml"]
+    # An MJCF is written as its own file, where they move.
+    stands = f"motion of joint {one}" in exported(still, ["mjcf"])["repaired.xml"]
+    assert stands == (which == "urdf")
     assert ("joint fore is called fore_joint" in text) == (which == "urdf")
     assert "joint d.fore has drag" in text or "joint d.yaw has drag" in text
     (tmp_path / "again.sdf").write_text(text)
@@ -408,6 +410,60 @@ def test_a_urdf_is_written_of_a_xacro(tmp_path):
     assert masses == [1.5, 2.5]
 
 
+def test_an_mjcf_is_written_as_the_file_that_it_is(tmp_path):
+    """Shapes, names and the servo's command stay; its gain, friction and loads are
+    those of the scene, and it moves as our own simulation."""
+    file = tmp_path / "crane.xml"
+    file.write_text(LOOSE.replace('type="box"', 'type="box" contype="2"'))
+    scene = double(tmp_path)
+    scene.directives[:] = scene.directives[:1]
+    scene.directives[0].add_model.file = f"file://{file}"
+    actuation = ActuationSection(
+        type="servo", joints=["d.yaw"], kp=[50.0], kd=[4.0], limit=[25.0],
+        supply=SupplySection(voltage=[1e3], kt=[1.0], resistance=[1.0]),
+    )  # fmt: skip
+    scene = with_effects(
+        replace(scene, actuation=actuation),
+        ("servo_gain", "d.yaw", dict(kp=30.0)),
+        ("joint_coulomb_friction", "d.slide", dict(coulomb=1.0)),
+        ("joint_viscous_damping", "d.slide", dict(damping=3.0)),
+        ("payload", "d.arm", dict(mass=0.4, com_x=0.05, com_y=0.01, com_z=-0.04)),
+        ("joint_quadratic_drag", "d.turn", dict(coefficient=0.1)),
+    )
+    text = exported(scene, ["mjcf"])["repaired.xml"]
+    assert "Not in this file: joint d.turn has drag" in text and "<position" in text
+    assert text.count("Not in this file") == 1
+    model, data = in_mujoco(text)
+    given = mujoco.MjModel.from_xml_path(str(file))
+    assert model.body("twin").id == given.body("twin").id and model.nbody == 5
+    np.testing.assert_allclose(model.geom_size, given.geom_size, rtol=1e-5)
+    np.testing.assert_array_equal(model.geom_contype, given.geom_contype)
+    assert model.actuator_gainprm[0, 0] == 30.0 and model.nu == 1
+    np.testing.assert_allclose(model.actuator_biasprm[0, :3], [0.0, -30.0, -4.0])
+    # The file's, and the back-EMF of 1 V s on 1 ohm; then one of the effects.
+    np.testing.assert_allclose(model.dof_damping, [1.2, 3.0, 0.0])
+    np.testing.assert_allclose(model.actuator_forcerange, [[-25.0, 25.0]])
+    said = [each for each in scene.effects if each.kind != "joint_quadratic_drag"]
+    times = np.arange(0.0, 1.0, 0.05)
+    commands = {"d.yaw.position_command": 0.6 * np.sin(5.0 * times)}
+    names = ("yaw", "slide", "turn")
+    rows = SceneSimulation(replace(scene, effects=said)).run(
+        at_rest_but({"d.yaw": 0.0, "d.slide": 0.1, "d.turn": 0.4}), times,
+        [f"d.{name}.position" for name in names], Commands(times, commands),
+    )  # fmt: skip
+    model.opt.timestep, replayed = 5e-4, []
+    for off in (mujoco.mjtDisableBit.mjDSBL_CONTACT, mujoco.mjtDisableBit.mjDSBL_LIMIT):
+        model.opt.disableflags |= off  # As in a continuous plant without contact.
+    for name, q in zip(names, (0.0, 0.1, 0.4), strict=True):
+        data.joint(name).qpos = q
+    for k in range(len(times)):
+        replayed.append([data.joint(name).qpos[0] for name in names])
+        data.ctrl[0] = commands["d.yaw.position_command"][k]
+        mujoco.mj_step(model, data, 100)
+    np.testing.assert_allclose(replayed, rows, atol=0.01)  # As above.
+    assert np.ptp(rows[:, :2], axis=0).min() > 0.3
+
+
 @pytest.mark.parametrize("which", ["urdf", "mjcf"])
 def test_a_robot_that_stands_on_nothing_is_free_in_what_is_written(tmp_path, which):
     """Its energies are those of the scene, in MuJoCo and of the SDF in Drake."""
@@ -428,10 +484,12 @@ def test_a_robot_that_stands_on_nothing_is_free_in_what_is_written(tmp_path, whi
     actuation = ActuationSection(type="effort", joints=[f"d.{joint}"])
     scene = with_effects(replace(base, actuation=actuation), load)
     texts = exported(scene, ["mjcf", "sdf"])
-    assert "shapes, so nothing holds d.base" in texts["repaired.xml"]
+    told = "shapes, so nothing holds d.base" in texts["repaired.xml"]
+    assert told == (which == "urdf")  # An MJCF is its own, with its shapes.
     model, data = in_mujoco(texts["repaired.xml"])
     start = [0.0, 0.0, 0.1 if which == "mjcf" else 0.0]
-    np.testing.assert_allclose(model.body("d.base").pos, start)
+    np.testing.assert_allclose(model.body(1).pos, start)
+    exact = 1e-9 if which == "urdf" else 1e-5  # MuJoCo writes six digits.
     (tmp_path / "again.sdf").write_text(texts["d.sdf"])
     again = replace(copy.deepcopy(base), actuation=ActuationSection(type="none"))
     again.directives[0].add_model.file = f"file://{tmp_path / 'again.sdf'}"
@@ -444,7 +502,7 @@ def test_a_robot_that_stands_on_nothing_is_free_in_what_is_written(tmp_path, whi
         quat, p, w, v = (rng.normal(size=n) for n in (4, 3, 3, 3))
         X = RigidTransform(RotationMatrix(Quaternion(quat / np.linalg.norm(quat))), p)
         angles, rates = rng.uniform(-1, 1, (2, model.njnt - 1))
-        names = [model.joint(i).name.partition(".")[2] for i in range(1, model.njnt)]
+        names = [model.joint(i).name.rpartition(".")[2] for i in range(1, model.njnt)]
         energies = []
         for plant in plants:
             context = plant.CreateDefaultContext()
@@ -469,11 +527,11 @@ def test_a_robot_that_stands_on_nothing_is_free_in_what_is_written(tmp_path, whi
         mujoco.mj_energyPos(model, data)
         energies.append([0.5 * data.qvel @ momentum, data.energy[0]])
         kinetic, potential = np.transpose(energies)
-        np.testing.assert_allclose(kinetic, kinetic[0], rtol=1e-9)
+        np.testing.assert_allclose(kinetic, kinetic[0], rtol=exact)
         heights.append(potential)
     # Potential energies may differ by a constant.
     change = np.diff(heights, axis=0)
-    np.testing.assert_allclose(change, np.tile(change[:, :1], 3), rtol=1e-9)
+    np.testing.assert_allclose(change, np.tile(change[:, :1], 3), rtol=exact)
 
 
 def test_what_a_format_cannot_say_is_told(tmp_path):

@@ -319,6 +319,7 @@ def exported(scene: Scene, formats: Sequence[str]) -> dict[str, str]:
         to_urdf,
     )
     from makebreak.models.model_files import robot_files
+    from makebreak.models.mujoco_twin import own_mjcf
 
     found = {}
     for each in formats:
@@ -333,7 +334,7 @@ def exported(scene: Scene, formats: Sequence[str]) -> dict[str, str]:
                 )
             continue
         if each == "mjcf":
-            found["repaired.xml"] = to_mjcf(scene)
+            found["repaired.xml"] = own_mjcf(scene) or to_mjcf(scene)
             continue
         if each == "isaaclab":
             found["isaaclab_actuators.py"] = to_isaac_lab(scene)
