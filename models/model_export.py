@@ -389,7 +389,7 @@ where joint friction is an effort).
 
 The law is effort = clip(stiffness (target - q) + damping (velocity target - v) + effort
 target), with targets that arrive late by the delay. Without an effort limit here, that
-of the asset holds. Masses and inertias are not here: `--export urdf` has them.
+of the asset holds. Masses and inertias are not here: `--export urdf,mjcf` has them.
 """
 
 from isaaclab.actuators import DelayedPDActuatorCfg
