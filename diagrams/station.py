@@ -108,8 +108,8 @@ def make_station(
     """The plant, its sensors and actuators.
 
     Inputs:  panda.torque_commanded (7,) [N m]: of the motors, clipped to the effort
-             limits; overhead.region (3,), optional: the part of the image that is
-             looked at (PinholeCamera, RegionCamera).
+             limits; overhead.region (3,), optional, of a camera that renders with VTK
+             (RegionCamera).
     Outputs of sensors, with noise:
              panda.position_measured (7,) [rad], panda.velocity_measured (7,) [rad/s],
              panda.torque_measured (7,) [N m]: of the motors, after the limits;
@@ -173,7 +173,8 @@ def make_station(
             )
         else:  # Faults may delay images.
             camera = builder.GetSubsystemByName("overhead_camera")
-            builder.ExportInput(camera.GetInputPort("region"), "overhead.region")
+            if camera.HasInputPort("region"):
+                builder.ExportInput(camera.GetInputPort("region"), "overhead.region")
         builder.ExportOutput(image, "overhead.rgb_image")
     if faults:
         _add_monitor(builder, plant, limit)

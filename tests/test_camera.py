@@ -309,33 +309,6 @@ def test_a_pinhole_of_wrong_shape_is_refused_by_name():
         Pinhole(320, 240, 300.0, np.zeros(2), np.zeros(2), np.eye(3))
 
 
-def test_a_region_is_drawn_as_in_the_whole_image_and_what_is_far_from_it_is_not():
-    shapes = [
-        (Sphere(RADIUS), ORANGE),
-        (Box(0.1, 0.02, 0.1), DARK),
-        (Sphere(0.03), DARK),
-    ]
-    studio = Studio(CameraConfig(renderer="drawn"), shapes)
-    camera = studio.diagram.GetSubsystemByName("overhead_camera")
-    own = camera.GetMyMutableContextFromRoot(studio.context)
-    ball = np.array([0.45, 0.12, RADIUS])
-    poses = ball, ball + [0.0, -0.06, 0.1], np.array([0.55, -0.2, 0.03])
-    whole = studio.picture(*poses)
-    pinhole = camera_model(CameraConfig(renderer="drawn"))
-    u, v, far_u, far_v = pinhole.project(
-        pinhole.to_camera(np.array(poses)[::2])
-    ).ravel()
-    region = camera.GetInputPort("region")
-    region.FixValue(own, [u, v, 30.0])
-    part = studio.picture(*poses)
-    near = np.s_[round(v) - 30 : round(v) + 31, round(u) - 30 : round(u) + 31]
-    np.testing.assert_array_equal(part[near], whole[near])
-    far = round(far_v), round(far_u)
-    assert whole[far][0] < 100 < part[far][0]  # The dark sphere, the table.
-    region.FixValue(own, np.full(3, np.nan))
-    np.testing.assert_array_equal(studio.picture(*poses), whole)
-
-
 @pytest.mark.skipif(not vtk_works(), reason="Drake cannot render here: no GL libraries")
 def test_a_region_has_the_pixels_of_the_whole_image_and_nothing_beyond():
     studio = Studio(CameraConfig(renderer="vtk"), [(Sphere(RADIUS), ORANGE)])

@@ -118,9 +118,7 @@ class PinholeCamera(LeafSystem):
     """Draws a plant's spheres, capsules, cylinders, boxes, ellipsoids and convex hulls
     with OpenCV, distant ones first.
 
-    Inputs:  body_poses (abstract) of the plant; region (3,), optional: centre [u, v]
-             and half the side of what is looked at [px], not a number for all of the
-             image. Moving shapes that are not near it are left out.
+    Inputs:  body_poses (abstract) of the plant.
     Outputs: rgb_image (abstract ImageRgba8U), drawn when evaluated.
 
     Args: camera: its pinhole model; plant: finalized.
@@ -144,7 +142,6 @@ class PinholeCamera(LeafSystem):
             anchored,
             self._prepared(anchored, bodies),
             [X_WB[i] for i in bodies],
-            camera.corners(),
         )
         scratch, ahead = self._background.copy(), np.array([0.0, 0.0, 1.0])
         # Compiles the machine code before the first image.
@@ -152,12 +149,11 @@ class PinholeCamera(LeafSystem):
         self._poses = self.DeclareAbstractInputPort(
             "body_poses", Value[list[RigidTransform]]()
         )
-        self._region = self.DeclareVectorInputPort("region", 3)
         self.DeclareAbstractOutputPort(
             "rgb_image",
             lambda: Value(ImageRgba8U(camera.width, camera.height)),
             self._draw,
-            prerequisites_of_calc={self._poses.ticket(), self._region.ticket()},
+            prerequisites_of_calc={self.input_port_ticket(self._poses.get_index())},
         )
 
     @staticmethod
@@ -178,13 +174,11 @@ class PinholeCamera(LeafSystem):
         pixels = output.get_mutable_value().mutable_data
         pixels[:] = self._background
         X_WB = [poses[i] for i in self._bodies]
-        region = self._region.Eval(context) if self._region.HasValue(context) else None
-        part = self._camera.corners(region)
-        self._paint(pixels, self._moving, self._in_body, X_WB, part)
+        self._paint(pixels, self._moving, self._in_body, X_WB)
 
-    def _paint(self, image, shapes, in_body, X_WB, part):
+    def _paint(self, image, shapes, in_body, X_WB):
         """Draws shapes into an image. Args: in_body: of _prepared; X_WB: poses of the
-        bodies; part: corners of what is looked at."""
+        bodies."""
         if not shapes:
             return
         camera, (body, p_BG, R_BG, extent) = self._camera, in_body
@@ -192,7 +186,7 @@ class PinholeCamera(LeafSystem):
         R_WB, p_WB = X[:, :, :3], X[:, :, 3]
         p = camera.to_camera(p_WB + (R_WB @ p_BG[:, :, None])[:, :, 0])
         R = camera.R_WC.T @ R_WB @ R_BG
-        seen = np.flatnonzero(visible(p, extent, camera, *part))
+        seen = np.flatnonzero(visible(p, extent, camera))
         for i in seen[np.argsort(-p[seen, 2], kind="stable")]:
             s = shapes[i]
             draw_visible(image, camera, s.kind, s.extent, p[i], R[i], s.color, s.points)

@@ -14,8 +14,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import LeafSystem
 from pydrake.systems.sensors import CameraInfo, ImageRgba8U
 
-from makebreak.systems.perception.numerics.pinhole import REGION_MARGIN
-
+MARGIN = 8  # Beyond what is asked for [px]: the image may be shaken, resampled.
 STEP = 16  # Sizes of a region, so that they hardly ever change [px].
 
 
@@ -65,8 +64,8 @@ class RegionCamera(LeafSystem):
 
     def _part(self, u, v, half) -> tuple[np.ndarray, np.ndarray]:
         """The corners (2,) of what is rendered [px], the upper ones exclusive."""
-        reach = half + REGION_MARGIN
-        ends = np.array([[u - reach, v - reach], [u + reach, v + reach]])
+        ends = np.array([[u - half - MARGIN, v - half - MARGIN],
+                         [u + half + MARGIN, v + half + MARGIN]])  # fmt: skip
         if not np.isfinite(ends).all():
             return np.zeros(2, int), self._size
         ends = np.vstack([ends, self._center - 1.0, self._center + 1.0])

@@ -16,9 +16,6 @@ NEAR = 0.01  # Shapes that reach nearer to the camera's plane are not drawn [m].
 N_OUTLINE = 48  # Corners of a circle; its sagitta is 0.002 of the radius.
 BANDS = (0.3, 0.55, 0.8, 1.0)  # Cosines between which a sphere is drawn in one shade.
 
-# Beyond a region that is looked at [px]: the image may be shaken, resampled.
-REGION_MARGIN = 8
-
 SHAPES = ("sphere", "capsule", "cylinder", "box", "ellipsoid")
 SPHERE, CAPSULE, CYLINDER, BOX, ELLIPSOID = range(5)
 
@@ -63,15 +60,6 @@ class Pinhole:
                 raise ValueError(f"Pinhole.{name} is {value.shape}, expected {shape}")
             value.setflags(write=False)
             object.__setattr__(self, name, value)
-
-    def corners(self, region=None):
-        """Corners low, high (2,) [px] of the part of the image about a region: centre
-        u, v and half the side of what is looked at [px]. None, or not a number: all."""
-        low, high = np.zeros(2), np.array([self.width, self.height], dtype=float)
-        if region is None or not np.isfinite(region).all():
-            return low, high
-        reach = region[2] + REGION_MARGIN
-        return region[:2] - reach, region[:2] + reach
 
     def project(self, p_C):
         """Pixels (n, 2) of points (n, 3) [m] in C in front of the camera."""
@@ -152,7 +140,7 @@ def draw(image, camera, shape, size, p, R, color):
         color: (3,), 0..255, in full light.
     """
     extent = extents(shape, size)
-    if visible(p[None], extent[None], camera, *camera.corners())[0]:
+    if visible(p[None], extent[None], camera)[0]:
         draw_visible(image, camera, SHAPES.index(shape), extent, p, R, color)
 
 
@@ -166,13 +154,12 @@ def extents(shape, size):
     return np.asarray(size, float) / (2.0 if shape == "box" else 1.0)
 
 
-def visible(p, extent, camera, low, high):
-    """Whether shapes may be in a part of the image (n,), by bounding spheres.
+def visible(p, extent, camera):
+    """Whether shapes may be in the image (n,), by bounding spheres.
 
-    Args: p (n, 3): their centres in C [m]; extent (n, 3): of `extents` [m]; low, high
-        (2,): corners of the part [px].
+    Args: p (n, 3): their centres in C [m]; extent (n, 3): of `extents` [m].
     """
-    return _visible(p, extent, camera.focal, camera.center - low, *(high - low))
+    return _visible(p, extent, camera.focal, camera.center, camera.width, camera.height)
 
 
 @njit(cache=True)
