@@ -85,9 +85,7 @@ def test_one_model_is_the_plain_filter():
         p, v, P = constant_velocity.predict(p, v, P, DT, QUIET)
         p, v, P = constant_velocity.correct(p, v, P, z, SIGMA)
         estimate = interacting_models.correct(
-            *interacting_models.predict(*estimate, chances, DT, np.array([QUIET])),
-            z,
-            SIGMA,
+            *interacting_models.predict(*estimate, chances, DT, [QUIET]), z, SIGMA
         )
     for one, other in zip(
         interacting_models.combined(*estimate), (p, v, P), strict=True

@@ -143,7 +143,6 @@ class BallTracker(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(
             config.period_sec, config.offset_sec, self._update
         )
-        first_call(interacting_models.warm_up)
         first_call(self._first_call, camera, config.ball_radius)
 
     def _first_call(self, camera: Pinhole, ball_radius: float):
@@ -270,7 +269,6 @@ def _flat(estimate):
 
 
 def _unflat(numbers):
-    numbers = np.array(numbers)  # One that can be written to, for compiled code.
     m = len(numbers) // _PER_MODEL
     return (
         numbers[: 4 * m].reshape(m, 4),

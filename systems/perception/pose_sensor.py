@@ -147,7 +147,7 @@ class PoseSensor(LeafSystem):
             else:
                 pose = corrected(predicted(pose, at, c.density), p, q, std)
             if c.rolling_axis:
-                rolling = self._corrected_rolling(rolling, np.array(p[:2]), std[0])
+                rolling = self._corrected_rolling(rolling, p[:2], std[0])
                 (x, y), v, _ = interacting_models.combined(*rolling)
                 pose = pose._replace(
                     p=np.array([x, y, pose.p[2]]), v=np.array([*v, 0.0])

@@ -17,7 +17,7 @@ def predict(p, v, P, dt, q):
     Args: p, v (2,) [m], [m/s]; P (3,); q [m^2/s^3].
     Returns: p, v, P.
     """
-    P_pp, P_pv, P_vv = P[0], P[1], P[2]
+    P_pp, P_pv, P_vv = P
     P = np.array(
         [
             P_pp + 2.0 * dt * P_pv + dt**2 * P_vv + q * dt**3 / 3.0,
@@ -34,7 +34,7 @@ def correct(p, v, P, measured, sigma):
     Args: p, v, measured (2,); P (3,); sigma [m].
     Returns: p, v, P.
     """
-    P_pp, P_pv, P_vv = P[0], P[1], P[2]
+    P_pp, P_pv, P_vv = P
     S = P_pp + sigma**2
     innovation = measured - p
     P = np.array([P_pp * sigma**2, P_pv * sigma**2, P_vv * S - P_pv**2]) / S
