@@ -4,9 +4,10 @@ from collections.abc import Callable, Sequence
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from scipy.optimize import differential_evolution, least_squares, minimize
+from scipy.optimize import differential_evolution, least_squares
 
 from makebreak.gap.budget import go_on
+from makebreak.gap.numerics.agreed_step import agreed_step
 from makebreak.gap.numerics.selection import Screen, spread_by_blocks
 from makebreak.gap.problem import Fitted, GapProblem
 from makebreak.models.effects import KINDS
@@ -20,11 +21,12 @@ SHORT = 8  # Evaluations: a fit of no more is not asked to converge.
 # Of what a step changed, what slopes may have missed: to be kept, and to be as good as
 # exact; and of all that is left, what is nothing.
 BENT, STRAIGHT, NOTHING = 0.1, 1e-2, 1e-6
-# Of a parameter's size: first steps of a search without slopes, and how far around one
-# looks where that ended.
-WANDER, AROUND = 0.2, 0.5
+AROUND = 0.5  # Of a parameter's size: how far a search without slopes looks.
 MOST_FAR = 450  # Simulations, about.
-MOST_FREE = 6  # Parameters of a search without slopes.
+# Of a search by blocks of time: steps, shares of each that are tried, and the least of
+# what is left that a step must take off.
+MOST_BY_BLOCKS, SHARES_OF_STEP, BETTER = 8, (1.0, 0.5, 0.25), 0.02
+MOST_FREE = 6  # Parameters that are searched where errors jump.
 ROUGH = np.linspace(0.85, 1.15, 16)  # Of a start, tried.
 
 
@@ -309,21 +311,56 @@ def tangents(
     return slopes.columns(free.x0 / free.scale), of
 
 
-def derivative_free_search(
+def search_by_blocks(
     problem: GapProblem,
     screen: Screen,
     start: Sequence[Effect],
     fixed: Sequence[Sequence[str]],
-    far: bool = False,
-    most: int = 200,
 ) -> tuple[Effect, ...] | None:
-    """Effects from which a fit may go on where its gradient misled it: when which foot
-    lands first changes, the error jumps, and slopes tell little. None: of so many
-    parameters no such search tells anything.
+    """Effects from which a fit may go on, by steps that blocks of time ask for in which
+    columns say what a step does (agreed_step), while the training rows get better.
+    None: so many parameters cost too many simulations."""
+    free = _Free(problem, start, [tuple(names) for names in fixed])
+    if len(free.names) > MOST_FREE:
+        return None
+    low, high = free.low / free.scale, free.high / free.scale
+    train, block = problem.train(), problem.blocks()
 
-    Nelder and Mead's search, of `most` simulations; `far`, differential evolution,
-    which leaves valleys.
-    """
+    def residual(z) -> np.ndarray:
+        go_on()
+        return problem.residual(free.effects(z))
+
+    def left(z) -> np.ndarray | None:
+        try:
+            return screen.fit_nuisances(residual(z))[1][train]
+        except (ValueError, RuntimeError):  # Such parameters are refused.
+            return None
+
+    z, slopes = free.x0 / free.scale, _Slopes(problem, free, residual, None, None)
+    now = left(z)
+    for _ in range(MOST_BY_BLOCKS if now is not None else 0):
+        step, _ = agreed_step(-slopes.columns(z)[train], now, block[train])
+        for share in SHARES_OF_STEP:
+            there = np.clip(z + share * step, low, high)
+            then = left(there)
+            if then is not None and np.linalg.norm(then) < np.linalg.norm(now):
+                break
+        else:
+            break
+        better = 1.0 - np.linalg.norm(then) / np.linalg.norm(now)
+        z, now = there, then
+        if better < BETTER:
+            break
+    return tuple(_tidy(e) for e in free.effects(z))
+
+
+def search_far(
+    problem: GapProblem, screen: Screen, start: Sequence[Effect],
+    fixed: Sequence[Sequence[str]],
+) -> tuple[Effect, ...] | None:  # fmt: skip
+    """The same out of a valley, by differential evolution: when which foot lands first
+    changes, the error jumps, and slopes tell little. None: of so many parameters no
+    such search tells anything."""
     free = _Free(problem, start, [tuple(names) for names in fixed])
     if len(free.names) > MOST_FREE:
         return None
@@ -339,18 +376,10 @@ def derivative_free_search(
         return float(error) if np.isfinite(error) else 1e6
 
     z0 = free.x0 / free.scale
-    if far:
-        found = differential_evolution(
-            cost, [(z - AROUND, z + AROUND) for z in z0], x0=z0, init="sobol",
-            maxiter=min(15, MOST_FAR // (6 * len(z0))), popsize=6, polish=False, rng=0,
-        )  # fmt: skip
-    else:
-        corners = np.vstack([z0, z0 + WANDER * np.eye(len(z0))])
-        found = minimize(
-            cost, z0, method="Nelder-Mead",
-            options={"initial_simplex": corners, "maxfev": min(40 * len(z0), most),
-                     "xatol": 1e-3, "fatol": 1e-2},
-        )  # fmt: skip
+    found = differential_evolution(
+        cost, [(z - AROUND, z + AROUND) for z in z0], x0=z0, init="sobol",
+        maxiter=min(15, MOST_FAR // (6 * len(z0))), popsize=6, polish=False, rng=0,
+    )  # fmt: skip
     return tuple(_tidy(e) for e in free.effects(found.x))
 
 

@@ -136,10 +136,9 @@ DIFFERS_SHARE = 0.3
 
 # ----- How much is tried
 
-# Where errors jump with parameters, so many of the best candidates are searched without
-# derivatives before one is chosen, with so many simulations each.
+# Where errors jump with parameters, so many of the best candidates are searched by
+# blocks of time before one is chosen.
 FINALISTS = 4
-FINALIST_SIMULATIONS = 80
 
 # ----- The verdict
 

@@ -8,6 +8,7 @@ import numpy as np
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Candidate, Fitted
 from makebreak.gap.result import Considered
+from makebreak.gap.search.by_simulation import ranked_by_simulation
 from makebreak.gap.search.choice import (
     Choice,
     Trial,
@@ -71,6 +72,11 @@ def add_next(
     screen = search.screen(current.r, scale)
     base = screen.evaluate(current.r)
     ranked = with_pruned_groups(search, wide, ranked)
+    clear = search.plan.by_channel or ranked[0].fit.score <= _CLEAR_GAIN * base.score
+    if search.counts_evidence and ranked:
+        found_by = ranked_by_simulation(search, wide, ranked, chosen, current)
+        ranked = [r for evidence, r in found_by if evidence > EVIDENCE_MIN]
+        clear = bool(ranked)
     table = tuple(
         Considered(
             r.candidate.kind, tuple(r.candidate.at),
@@ -80,10 +86,12 @@ def add_next(
     )  # fmt: skip
     none = Step((), None, table)
     by_model = search.problem.weighed_by([c.effect for c in chosen]) is not None
-    short = shortlist(ranked, base.score, search.plan.shortlist, by_model)
+    short = shortlist(
+        ranked, base.score, search.plan.shortlist, by_model, search.counts_evidence
+    )
     if not short:
         return none
-    if not search.plan.by_channel and ranked[0].fit.score > _CLEAR_GAIN * base.score:
+    if not clear:
         return none
     screen, trials = _fitted_exactly(search, scale, chosen, current, short)
     if not trials:

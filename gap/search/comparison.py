@@ -7,6 +7,7 @@ import numpy as np
 from makebreak.gap.budget import present
 from makebreak.gap.fit import fit_effects, tangents
 from makebreak.gap.numerics.selection import (
+    LinearFit,
     Screen,
     by_block,
     is_plausible,
@@ -114,9 +115,12 @@ class Comparison:
 
     def may_need_more(self, fitted: Fitted) -> bool:
         """The same, or one channel is above what an effect of it alone must be beyond,
-        where models can be compared by evidence."""
+        where models can be compared by evidence. Where nothing but evidence says it,
+        candidates are asked, unless the scene as it came was above the noise."""
         if self.needs_more(fitted):
             return True
+        if self.counts_evidence:
+            return not (fitted.effects and self.needs_more(self.start))
         if not self.tells_by_evidence or not self.plan.by_channel:
             return False
         noisy = self.problem.in_noise(fitted.left)
@@ -247,6 +251,21 @@ class Comparison:
         n = self.nuisances.prior
         cost = [float(np.sum((f.b / n) ** 2)) for f in (one, other)]
         return self._evidence(one.left, other.left, least, more) + cost[1] - cost[0]
+
+    @property
+    def counts_evidence(self) -> bool:
+        """Whether evidence of all rows together says what is missing: that of simulated
+        windows, in which channels do not count alone."""
+        return self.tells_by_evidence and self.plan.jumps and not self.plan.by_channel
+
+    def evidence_of(self, screen: Screen, X: np.ndarray) -> float:
+        """The same of columns (m, k) against none."""
+        return self.evidence_by_columns(screen, X, X[:, :0])
+
+    def evidence_against(self, left, fit: LinearFit, other: Fitted, more: int) -> float:
+        """The same of what a model leaves of rows (m,), and its fit, over another."""
+        least = min(fit.held_out, other.fit.held_out)
+        return self._evidence(left, other.left, least, more)
 
     def evidence_by_columns(self, screen: Screen, one, other) -> float:
         """The same of columns (m, k), beside others that a screen may have as further

@@ -7,7 +7,7 @@ from functools import partial
 from itertools import pairwise
 
 from makebreak.gap.budget import Stopped
-from makebreak.gap.fit import derivative_free_search, fit_effects
+from makebreak.gap.fit import fit_effects, search_by_blocks, search_far
 from makebreak.gap.problem import Fitted
 from makebreak.gap.result import Considered
 from makebreak.gap.search.add import add_next
@@ -132,16 +132,14 @@ def _converged(search: Comparison, chosen: Sequence[Choice], current: Fitted) ->
     has not reached yet would be looked for in other effects."""
     fixed, jumps = fixed_parameters(chosen), search.plan.jumps
     steps = 2 * search.plan.evaluations
-    for far in (False, True) if jumps else (False,):
+    for look in (search_by_blocks, search_far) if jumps else (None,):
         if not search.needs_more(current):
             break
         screen = search.screen(current.r, current.fit.train)
         effects: tuple[Effect, ...] | None = current.effects
         try:
-            if jumps:
-                effects = derivative_free_search(
-                    search.problem, screen, current.effects, fixed, far
-                )
+            if look is not None:
+                effects = look(search.problem, screen, current.effects, fixed)
             if effects is None:
                 break
             more = fit_effects(search.problem, screen, effects, fixed, steps)

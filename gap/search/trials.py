@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from makebreak.gap.fit import MOST_FREE, derivative_free_search, fit_effects
+from makebreak.gap.fit import MOST_FREE, fit_effects, search_by_blocks
 from makebreak.gap.numerics.selection import Screen, simplest
 from makebreak.gap.problem import Candidate
 from makebreak.gap.search.choice import (
@@ -18,7 +18,6 @@ from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.search.screen import Ranked
 from makebreak.gap.thresholds import (
     EVIDENCE_MIN,
-    FINALIST_SIMULATIONS,
     FINALISTS,
     NESTED_GAIN,
     NOISE_RMS_MAX,
@@ -37,7 +36,11 @@ _SAME_BODY = 1.002  # Errors of bodies that one effect cannot tell apart.
 
 
 def shortlist(
-    ranked: Sequence[Ranked], base: float, most: int, inner_rivals: bool = False
+    ranked: Sequence[Ranked],
+    base: float,
+    most: int,
+    inner_rivals: bool = False,
+    rough: bool = False,
 ) -> list[Ranked]:
     """The candidates worth an exact fit: those near the best, at most two places of a
     kind and size (four that do alike); of each kind that the catalogue lists as
@@ -46,7 +49,8 @@ def shortlist(
 
     Args: ranked: the best first. base: the error without any. most: of those near the
         best. inner_rivals: whether also what is confused with a kind that the best
-        contains.
+        contains. rough: whether errors say so little of exact fits that none of a few
+        parameters is too far from the best.
     """
     if not ranked:
         return []
@@ -58,7 +62,8 @@ def shortlist(
             if (r.candidate.kind, r.candidate.size, bool(r.candidate.members))
             == (each.candidate.kind, each.candidate.size, bool(each.candidate.members))
         ]  # fmt: skip
-        near = each.fit.score < max(
+        few = rough and each.candidate.size <= MOST_FREE
+        near = few or each.fit.score < max(
             _NEAR_RATIO * best, best + _NEAR_SHARE * (base - best)
         )
         alike = like and each.fit.score <= _ALIKE * like[0].fit.score
@@ -125,8 +130,7 @@ def fit_each(
 def _search_finalists(
     search: Comparison, screen: Screen, chosen: Sequence[Choice], trials: list[Trial]
 ) -> None:
-    """The best few once more, without derivatives: else one whose fit got stuck
-    loses."""
+    """The best few once more, by blocks of time: else one whose fit got stuck loses."""
     best = sorted(range(len(trials)), key=lambda k: trials[k].fit.score)[:FINALISTS]
     if not best or not trials[best[0]].fit.score > NOISE_RMS_MAX:
         return
@@ -134,9 +138,7 @@ def _search_finalists(
         fit, each = trials[k]
         fixed = [*fixed_parameters(chosen), *each.fixed()]
         try:
-            effects = derivative_free_search(
-                search.problem, screen, fit.effects, fixed, most=FINALIST_SIMULATIONS
-            )
+            effects = search_by_blocks(search.problem, screen, fit.effects, fixed)
             if effects is None:
                 continue
             better = fit_effects(search.problem, screen, effects, fixed)
