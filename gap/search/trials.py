@@ -132,7 +132,10 @@ def _search_finalists(
 ) -> None:
     """The best few once more, by blocks of time: else one whose fit got stuck loses."""
     best = sorted(range(len(trials)), key=lambda k: trials[k].fit.score)[:FINALISTS]
-    if not best or not trials[best[0]].fit.score > NOISE_RMS_MAX:
+    if not best:
+        return
+    found = not trials[best[0]].fit.score > NOISE_RMS_MAX
+    if found and search.needs_more(search.start):
         return
     for k in best:
         fit, each = trials[k]
