@@ -330,25 +330,25 @@ def search_by_blocks(
         go_on()
         return problem.residual(free.effects(z))
 
-    def left(z) -> np.ndarray | None:
+    def left(z) -> np.ndarray:
         try:
             return screen.fit_nuisances(residual(z))[1][train]
         except (ValueError, RuntimeError):  # Such parameters are refused.
-            return None
+            return np.full(int(train.sum()), np.inf)
 
     z, slopes = free.x0 / free.scale, _Slopes(problem, free, residual, None, None)
     now = left(z)
-    for _ in range(MOST_BY_BLOCKS if now is not None else 0):
+    for _ in range(MOST_BY_BLOCKS if np.isfinite(now).all() else 0):
         step, _ = agreed_step(-slopes.columns(z)[train], now, block[train])
-        for share in SHARES_OF_STEP:
-            there = np.clip(z + share * step, low, high)
-            then = left(there)
-            if then is not None and np.linalg.norm(then) < np.linalg.norm(now):
-                break
-        else:
+        tried = [np.clip(z + share * step, low, high) for share in SHARES_OF_STEP]
+        then = next(
+            ((x, r) for x in tried
+             if np.linalg.norm(r := left(x)) < np.linalg.norm(now)), None,
+        )  # fmt: skip
+        if then is None:
             break
-        better = 1.0 - np.linalg.norm(then) / np.linalg.norm(now)
-        z, now = there, then
+        better = 1.0 - np.linalg.norm(then[1]) / np.linalg.norm(now)
+        z, now = then
         if better < BETTER:
             break
     return tuple(_tidy(e) for e in free.effects(z))

@@ -38,6 +38,8 @@ class SearchPlan:
         has.
     simulation_agrees: whether agreement also needs simulated windows that agree.
     loud: rms over noise of one channel that is a gap, whatever the others leave.
+    counts_evidence: whether rows are over the covariance that they have, and the law of
+        contact is that of the data, so that evidence counts below the noise, too.
     """
 
     evaluations: int = 8
@@ -51,6 +53,7 @@ class SearchPlan:
     alike: bool = False
     simulation_agrees: bool = False
     loud: float = 3.0
+    counts_evidence: bool = False
 
 
 @dataclass(frozen=True, eq=False)

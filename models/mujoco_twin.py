@@ -144,6 +144,12 @@ class MujocoTwin:
             drive.gainprm[0] = 1.0
             drive.ctrllimited = 0  # Whatever the file's default is.
 
+    def body_of(self, shape: str) -> str:
+        """The name, in the file, of the body that has a shape of this name."""
+        m, writer = self._writer.m, self._writer
+        names = [writer.name_of("geom", g) for g in range(m.ngeom)]
+        return writer.body_of(names.index(shape))
+
     def with_effects(self, effects: Sequence[Effect]) -> Twin:
         """Args: effects: all of the scene's; those of sensors do not count.
 

@@ -64,7 +64,7 @@ class Bends(GapProblem):
     """Two joints' dampings: a third of the blocks is far from linear in a joint's own,
     of which one (`a`) is hidden. size: of that, over the noise of a row."""
 
-    plan = SearchPlan(jumps=True, least_gain=0.05)
+    plan = SearchPlan(jumps=True, least_gain=0.05, counts_evidence=True)
     by_equations = False
     dynamics = SimpleNamespace(
         now=lambda kind, at: {"damping": 0.0}, least=lambda kind, at: {}

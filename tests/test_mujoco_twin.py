@@ -51,7 +51,8 @@ def own(**changes) -> np.ndarray:
     return np.array(rows)
 
 
-def simulated(folder, *effects: Effect) -> np.ndarray:
+def simulated(folder, *effects: Effect, noted: set | None = None) -> np.ndarray:
+    """The same by a scene. noted: the pairs that touch are added to it."""
     (folder / "w.xml").write_text(FILE.format(**PLAIN))
     (folder / "scene.yaml").write_text(
         "directives:\n- add_model: {name: w, file: w.xml}\n"
@@ -71,9 +72,13 @@ def simulated(folder, *effects: Effect) -> np.ndarray:
     axes = ("x", "y", "z", "qw", "qx", "qy", "qz")
     box = [f"w.box.{a}" for a in axes]
     channels = ["w.px.position", *box, "w.turn.position"]
-    return simulation.run(
-        initial, 0.01 * np.arange(1, 81), channels, commands, start_sec=0.0
-    )
+    with simulation.noting_pairs() as pairs:
+        path = simulation.run(
+            initial, 0.01 * np.arange(1, 81), channels, commands, start_sec=0.0
+        )
+    if noted is not None:
+        noted |= pairs
+    return path
 
 
 @pytest.mark.parametrize(
@@ -111,6 +116,27 @@ def test_effects_are_what_the_same_change_of_the_file_is(tmp_path, changes, effe
     np.testing.assert_allclose(
         simulated(tmp_path, *each)[same], expected[same], atol=1e-7
     )
+
+
+@pytest.mark.parametrize("wall", [0.4, 0.9])
+def test_pairs_that_touch_are_those_of_mujoco(tmp_path, wall, monkeypatch):
+    """What is fixed comes last; an arm that touches nothing is in none."""
+    monkeypatch.setitem(PLAIN, "wall", wall)
+    model = mujoco.MjModel.from_xml_string(FILE.format(**PLAIN))
+    data = mujoco.MjData(model)
+    expected, names = set(), ["floor", "wall", "pusher", "box"]
+    for qpos in own():
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_collision(model, data)
+        expected |= {
+            "~".join(f"w.{names[g]}" for g in sorted((c.geom1, c.geom2), reverse=True))
+            for c in data.contact
+        }
+    simulated(tmp_path, noted=(noted := set()))
+    order = {"w.box~w.pusher": "w.box~w.pusher", "w.pusher~w.box": "w.box~w.pusher"}
+    assert {order.get(at, at) for at in noted} == expected
+    assert ("w.box~w.wall" in noted) == (wall == 0.4)
 
 
 def test_what_mujoco_has_no_place_for_is_refused(tmp_path):

@@ -112,17 +112,17 @@ def contact_candidates(
     model: FreeBodyModel | WindowModel,
     there: Sequence[Effect],
     r: np.ndarray,
+    one_size: bool = False,
 ) -> list[Candidate]:
     """All kinds that free bodies and their contacts may show.
 
     Args: there, effects that are in the model already, and what they leave, r (m,).
+        one_size: whether one size of a pair's values is tried, as others are where it
+        is ranked: so all pairs can be a group.
     """
     found: list[Candidate] = []
     for kind in KINDS:
-        for place in model.dynamics.places(kind):
-            at = model.by_rider(place) if isinstance(model, FreeBodyModel) else place
-            if isinstance(model, FreeBodyModel) and at in model.never_met:
-                continue
+        for at in model.places_of(kind):
             if kind == "length_scale" and at == "world":
                 continue
             if kind in _OF_BODIES and at not in model.bodies:
@@ -137,7 +137,9 @@ def contact_candidates(
                 found += _patches(model, at, there, r)
                 continue
             for trials, names, fixed in _trials(model, kind, at):
-                each = _of(model, kind, at, trials, names, fixed, there, r)
+                pairs = one_size and KINDS[kind].at == "pair"
+                most = 1 if pairs else len(trials)
+                each = _of(model, kind, at, trials, names, fixed, there, r, most)
                 if each is not None:
                     found.append(each)
     return found
@@ -339,7 +341,8 @@ def _moments(now: dict, name: str, factor: float) -> dict[str, float]:
     return out
 
 
-def _of(model, kind, at, trials, names, fixed, there, r) -> Candidate | None:
+def _of(model, kind, at, trials, names, fixed, there, r, most) -> Candidate | None:
+    """With the first `most` of the trials that do something."""
     now = {p.name: p.neutral or 0.0 for p in KINDS[kind].parameters}
     now |= model.dynamics.now(kind, [at])
     columns, readers = [], []
@@ -359,6 +362,8 @@ def _of(model, kind, at, trials, names, fixed, there, r) -> Candidate | None:
             continue
         columns.append(np.stack(made, axis=1))
         readers.append(_reader(kind, now, trial[0][1], names, reach))
+        if len(columns) == most:
+            break
     if not columns:
         return None
     return Candidate(kind, (at,), len(names), tuple(columns), tuple(readers), fixed)

@@ -57,8 +57,11 @@ class MujocoProblem(WindowModel, WindowedProblem):
 
     plan = SearchPlan(
         evaluations=8, diff_step=5e-3, least_gain=0.05, most_effects=MOST_EFFECTS,
-        jumps=True, alike=True, loud=UNEXPLAINED_RMS,
+        jumps=True, alike=True, loud=UNEXPLAINED_RMS, counts_evidence=True,
     )  # fmt: skip
+
+    one_size = True
+    simulation: MujocoSimulation
 
     def __init__(
         self,
@@ -78,6 +81,7 @@ class MujocoProblem(WindowModel, WindowedProblem):
         self.windows = [self._as_smoothed(w) for w in self.windows]
         self._weighed_by: tuple = ()
         self._in_parts = False
+        self._pairs_met: set[str] | None = None
         if commands_late is not None:
             self.set_commands_late(commands_late)
         self._weigh(())
@@ -282,6 +286,15 @@ class MujocoProblem(WindowModel, WindowedProblem):
         others[k] = Effect(others[k].kind, others[k].at, moved)
         r = tried(self, *others)
         return np.nan if r is None else float(np.sum((r - calm) ** 2))
+
+    def places_of(self, kind: str) -> list[str]:
+        """Of pairs those that meet, links of a robot among them."""
+        if KINDS[kind].at != "pair":
+            return super().places_of(kind)
+        if self._pairs_met is None:
+            with self.simulation.noting_pairs() as self._pairs_met:
+                self.simulate(())
+        return sorted(self._pairs_met)
 
     def candidates(self, nuisances: Nuisances, current: Fitted) -> list[Candidate]:
         found = super().candidates(nuisances, current)

@@ -73,7 +73,7 @@ def add_next(
     base = screen.evaluate(current.r)
     ranked = with_pruned_groups(search, wide, ranked)
     clear = search.plan.by_channel or ranked[0].fit.score <= _CLEAR_GAIN * base.score
-    if search.counts_evidence and ranked:
+    if search.plan.counts_evidence and ranked:
         found_by = ranked_by_simulation(search, wide, ranked, chosen, current)
         ranked = [r for evidence, r in found_by if evidence > EVIDENCE_MIN]
         clear = bool(ranked)
@@ -87,7 +87,7 @@ def add_next(
     none = Step((), None, table)
     by_model = search.problem.weighed_by([c.effect for c in chosen]) is not None
     short = shortlist(
-        ranked, base.score, search.plan.shortlist, by_model, search.counts_evidence
+        ranked, base.score, search.plan.shortlist, by_model, search.plan.counts_evidence
     )
     if not short:
         return none

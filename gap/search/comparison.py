@@ -119,7 +119,7 @@ class Comparison:
         candidates are asked, unless the scene as it came was above the noise."""
         if self.needs_more(fitted):
             return True
-        if self.counts_evidence:
+        if self.plan.counts_evidence:
             return not (fitted.effects and self.needs_more(self.start))
         if not self.tells_by_evidence or not self.plan.by_channel:
             return False
@@ -251,12 +251,6 @@ class Comparison:
         n = self.nuisances.prior
         cost = [float(np.sum((f.b / n) ** 2)) for f in (one, other)]
         return self._evidence(one.left, other.left, least, more) + cost[1] - cost[0]
-
-    @property
-    def counts_evidence(self) -> bool:
-        """Whether evidence of all rows together says what is missing: that of simulated
-        windows, in which channels do not count alone."""
-        return self.tells_by_evidence and self.plan.jumps and not self.plan.by_channel
 
     def evidence_of(self, screen: Screen, X: np.ndarray) -> float:
         """The same of columns (m, k) against none."""

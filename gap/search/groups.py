@@ -26,7 +26,7 @@ from makebreak.gap.thresholds import (
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 
-_PLACES = ("joint", "actuator", "channel", "drive")
+_PLACES = ("joint", "actuator", "channel", "drive", "pair")
 # Units of what a joint may have beside what all joints have.
 _FORCES = ("N m", "N m s/rad", "N m/rad", "kg m2")
 

@@ -201,7 +201,12 @@ class FreeBodyModel(WindowedResidual):
         """The scene's, without further effects, that `at` (a body or a pair) names."""
         return self._bodies.each[self.bodies.index(first_of(self, at))]
 
-    def by_rider(self, at: str) -> str:
+    def places_of(self, kind: str) -> list[str]:
+        """Where a kind may act."""
+        places = map(self._by_rider, self.dynamics.places(kind))
+        return [at for at in places if at not in self.never_met]
+
+    def _by_rider(self, at: str) -> str:
         """A pair of bodies with the one first that lies on the other: an effect on the
         pair changes the surface of the first one, which the other's friction with what
         itself lies on does not depend on."""

@@ -1,6 +1,7 @@
 """Windows of recordings simulated by MuJoCo, with the contact of the model's file."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 
 import numpy as np
 
@@ -8,9 +9,11 @@ from makebreak.gap.budget import go_on
 from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.simulation.scene_simulation import SceneSimulation
 from makebreak.gap.simulation.sensor_samples import between
-from makebreak.models.effects.kind import Effect
+from makebreak.models.effects.kind import Effect, full_name, model_names
 from makebreak.models.mujoco_twin import MujocoTwin
 from makebreak.models.scene import InitialSection, Scene
+
+NOTED = 5  # Steps.
 
 
 class MujocoSimulation(SceneSimulation):
@@ -26,6 +29,7 @@ class MujocoSimulation(SceneSimulation):
         except ValueError as error:
             raise DoesNotFit(str(error)) from None
         super().__init__(scene)
+        self._met: set[str] | None = None
         self.set_effects(scene.effects)
 
     def set_effects(self, effects: Sequence[Effect]) -> None:
@@ -33,6 +37,42 @@ class MujocoSimulation(SceneSimulation):
         self._twin = self._twins.with_effects(effects)
         self._current = tuple(effects)
         self._commands.set_effects(self._current)
+
+    @contextmanager
+    def noting_pairs(self) -> Iterator[set[str]]:
+        """The pairs of bodies that touch in what is simulated meanwhile, the one that
+        is fixed last."""
+        self._met = set()
+        try:
+            yield self._met
+        finally:
+            self._met = None
+
+    def _pairs_in(self, states: np.ndarray) -> set[str]:
+        """Of states (n, n_q + n_v), one in NOTED of them."""
+        import mujoco
+
+        model, plant = self._twin.model, self._plant
+        data = mujoco.MjData(model)
+        fixed = {b.index() for b in plant.GetBodiesWeldedTo(plant.world_body())}
+        bodies = [
+            plant.get_body(i)
+            for name in model_names(plant)
+            for i in plant.GetBodyIndices(plant.GetModelInstanceByName(name))
+        ]
+        names = {b.name(): (b.index() in fixed, full_name(plant, b)) for b in bodies}
+        geoms = set[tuple[int, int]]()
+        for state in states[::NOTED]:
+            data.qpos[:] = state[: model.nq]
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_collision(model, data)
+            geoms |= {(c.geom1, c.geom2) for c in data.contact}
+        pairs = set[str]()
+        for pair in geoms:
+            a, b = (self._twins.body_of(model.geom(g).name) for g in pair)
+            if a in names and b in names and a != b:
+                pairs.add("~".join(at for _, at in sorted([names[a], names[b]])))
+        return pairs
 
     def channels(self) -> list[str]:
         """The measured channels that are simulated: no efforts."""
@@ -77,6 +117,8 @@ class MujocoSimulation(SceneSimulation):
         mujoco.mj_getState(model, data, first, spec)
         states, _ = rollout(model, data, first[None], control[None], nstep=n)
         every = np.vstack([first, states[0]])[:, 1:]
+        if self._met is not None:
+            self._met |= self._pairs_in(every)
         path = np.empty((n + 1, len(x)))
         path[:, :n_q] = every[:, twin.q]
         path[:, n_q:] = every[:, model.nq + twin.v]

@@ -568,6 +568,10 @@ class WindowModel(WindowedResidual):
         act = self.scene.actuation
         return act.joints if quantity in COMMANDS_OF[act.type] else []
 
+    def places_of(self, kind: str) -> list[str]:
+        """Where a kind may act."""
+        return self.dynamics.places(kind)
+
     # ----- Simulating
 
     def simulate(
