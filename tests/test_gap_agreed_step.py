@@ -1,6 +1,7 @@
 """Steps by the blocks of time in which columns are right, and candidates by simulation
 (gap/numerics/agreed_step.py, gap/search/by_simulation.py)."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,10 +11,12 @@ from makebreak.gap.fit import MOST_FREE, fit_effects, search_by_blocks
 from makebreak.gap.numerics.agreed_step import agreed_step
 from makebreak.gap.problem import GapProblem, Nuisances, SearchPlan, rms
 from makebreak.gap.residuals.impacts import candidates_of
+from makebreak.gap.search import trials
 from makebreak.gap.search.by_simulation import ranked_by_simulation
 from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.search.screen import rank
 from makebreak.gap.search.select import select
+from makebreak.gap.search.trials import fit_each
 from makebreak.gap.thresholds import (
     BESIDE_NOISE_EVIDENCE,
     EVIDENCE_MIN,
@@ -144,10 +147,44 @@ def test_candidates_are_ranked_by_what_simulations_leave():
     assert best.effects[0].parameters["damping"] == pytest.approx(2.0, abs=0.4)
 
 
-def test_what_is_below_the_noise_is_named_by_evidence_alone():
-    chosen = select(Bends(0.25)).choices
+def test_what_is_below_the_noise_is_named_by_evidence_alone(monkeypatch):
+    """And the best are searched by blocks, as they are above the noise."""
+    problem, searched = Bends(0.2), []
+    search = Comparison(problem, lambda text: None)
+    assert not search.needs_more(search.start)
+    monkeypatch.setattr(
+        trials, "search_by_blocks",
+        lambda *args: searched.append(args) or search_by_blocks(*args),
+    )  # fmt: skip
+    chosen = select(problem).choices
     assert [c.effect.at for c in chosen] == [["a"]]
     assert chosen[0].effect.parameters["damping"] == pytest.approx(2.0, abs=0.4)
+    assert searched
+
+
+def test_a_size_that_does_well_is_doubled_while_that_does_better():
+    """What a column says is a quarter of what is hidden."""
+    problem = Bends(3.0)
+    plain, problem.bent = problem.residual, np.zeros(ROWS * BLOCKS, bool)
+    asked = []
+
+    def residual(effects=()):
+        asked.append([e.parameters["damping"] for e in effects])
+        return plain(effects)
+
+    problem.residual = residual
+    search = Comparison(problem, lambda text: None)
+    screen = search.screen(search.start.r)
+    (first, *_) = rank(screen, problem.candidates(search.nuisances, search.start))
+    column = 4.0 * first.columns
+    less = replace(
+        first, candidate=replace(first.candidate, columns=(column,)),
+        fit=replace(first.fit, c=first.fit.c / 4.0),
+    )  # fmt: skip
+    asked.clear()
+    ((_, found), *_) = ranked_by_simulation(search, screen, [less], (), search.start)
+    assert found.effects[0].parameters["damping"] == pytest.approx(2.0, abs=0.1)
+    assert max(x for (x,) in asked) == pytest.approx(4.0, abs=0.2)
 
 
 def test_nothing_is_named_where_nothing_is_hidden():
@@ -174,3 +211,29 @@ def test_of_many_parameters_no_search_is_made():
         for k in range(MOST_FREE + 1)
     ]
     assert search_by_blocks(problem, screen, many, [()] * len(many)) is None
+
+
+def test_many_parameters_are_not_fitted_after_few_that_leave_clearly_less():
+    """One joint leaves the noise; what has many parameters, and leaves ten times as
+    much by what is known of it, is not simulated again."""
+    problem = Bends(5.0)
+    search, screen, found, _ = ranked_of(problem)
+    good = replace(
+        found[0],
+        effects=(Effect("joint_viscous_damping", ["a"], {"damping": 1.99}),),
+        fit=replace(found[0].fit, score=1.2),
+    )
+    many = replace(
+        found[1], candidate=replace(found[1].candidate, size=MOST_FREE + 1),
+        fit=replace(found[1].fit, score=10.0),
+    )  # fmt: skip
+    few = replace(many, candidate=replace(many.candidate, size=1))
+    asked = []
+    problem_residual = problem.residual
+    problem.residual = lambda effects=(): (
+        asked.append([e.at[0] for e in effects]), problem_residual(effects)
+    )[1]  # fmt: skip
+    fit_each(search, screen, (), [good, many])
+    assert ["b"] not in asked
+    fit_each(search, screen, (), [good, few])
+    assert ["b"] in asked

@@ -17,7 +17,7 @@ FILE = """
 <default><geom condim="4"/><position ctrlrange="-1 1"/><general ctrlrange="-1 1"/>
 </default><worldbody>
 <geom name="floor" type="plane" size="3 3 .1" friction="{floor}"/>
-<geom name="wall" type="box" size=".02 .5 .2" pos="{wall} 0 .2" euler="0 0 10"/>
+<geom name="a_wall" type="box" size=".02 .5 .2" pos="{wall} 0 .2" euler="0 0 10"/>
 <body name="pusher" pos="0 0 .05"><joint name="px" type="slide" axis="1 0 0"
  damping="{damping}" armature="{rotor}" frictionloss="{dry}"/>
  <geom type="sphere" size=".02" mass=".5" friction="{tip}"/></body>
@@ -86,7 +86,7 @@ def simulated(folder, *effects: Effect, noted: set | None = None) -> np.ndarray:
     [
         ({}, []),
         ({"mass": 0.9}, [("object_mass", "w.box", {"mass": 0.9})]),
-        ({"wall": 0.37}, [("wall_position", "w.wall", {"x": -0.03, "y": 0, "z": 0})]),
+        ({"wall": 0.37}, [("wall_position", "w.a_wall", {"x": -0.03, "y": 0, "z": 0})]),
         (
             {"damping": 28.0, "rotor": 0.4, "dry": 1.2, "kp": 900.0},
             [
@@ -124,7 +124,7 @@ def test_pairs_that_touch_are_those_of_mujoco(tmp_path, wall, monkeypatch):
     monkeypatch.setitem(PLAIN, "wall", wall)
     model = mujoco.MjModel.from_xml_string(FILE.format(**PLAIN))
     data = mujoco.MjData(model)
-    expected, names = set(), ["floor", "wall", "pusher", "box"]
+    expected, names = set(), ["floor", "a_wall", "pusher", "box"]
     for qpos in own():
         data.qpos[:] = qpos
         mujoco.mj_kinematics(model, data)
@@ -136,7 +136,7 @@ def test_pairs_that_touch_are_those_of_mujoco(tmp_path, wall, monkeypatch):
     simulated(tmp_path, noted=(noted := set()))
     order = {"w.box~w.pusher": "w.box~w.pusher", "w.pusher~w.box": "w.box~w.pusher"}
     assert {order.get(at, at) for at in noted} == expected
-    assert ("w.box~w.wall" in noted) == (wall == 0.4)
+    assert ("w.box~w.a_wall" in noted) == (wall == 0.4)
 
 
 def test_what_mujoco_has_no_place_for_is_refused(tmp_path):

@@ -99,7 +99,7 @@ def fit_each(
 ) -> list[Trial]:  # fmt: skip
     """Each candidate beside what is chosen, all fitted exactly, those with the fewest
     parameters first; those that are possible. Where simulations are all that there is,
-    not those of many once one of few leaves what noise does.
+    not those of many once one of few leaves what noise does, or clearly less than they.
 
     Args: known: fits of the same candidates, from where to go on.
     """
@@ -108,7 +108,7 @@ def fit_each(
         each = short[k]
         least = min((t.fit.score for t in found.values()), default=np.inf)
         many = search.plan.jumps and each.candidate.size > MOST_FREE
-        if many and least <= NOISE_RMS_MAX:
+        if many and least < max(NOISE_RMS_MAX, each.fit.score / _NEAR_RATIO):
             continue
         start = [*[c.effect for c in chosen], *each.effects]
         if known:
