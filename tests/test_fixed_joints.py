@@ -15,6 +15,7 @@ JOINT = """<joint name="{name}" type="{kind}"><parent link="{parent}"/>
 <limit lower="-1" upper="1" effort="50" velocity="2"/>{mimic}</joint>"""
 LINK = """<link name="{name}"><inertial><origin xyz="0.1 0.02 0"/><mass value="{mass}"/>
 <inertia ixx="0.01" iyy="0.02" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
+FOLLOWS = '"-0.5" offset="0.2"'
 MIMIC = '<mimic joint="left" multiplier="1"/>'
 
 
@@ -142,10 +143,11 @@ def test_couplings_are_read_from_every_format(suffix, text, tmp_path):
         (["shoulder", "elbow"], MIMIC, "{arm.left: 0, arm.right: 0}"),
         (["shoulder", "elbow"], "", "{arm.left: 0, arm.right: 0}"),
         (["shoulder", "elbow", "left", "right"], MIMIC, "{arm.left: 0.3"),
+        (["shoulder", "elbow", "left"], MIMIC.replace('"1"', FOLLOWS), "{arm.left: "),
         (["shoulder", "elbow", "left", "right"], "", None),
         (["elbow", "left", "right"], "", None),  # Where the shoulder is nobody knows.
     ],
-    ids=["not logged", "no mimic", "mimic", "free", "carries others"],
+    ids=["not logged", "no mimic", "mimic", "one logged", "free", "carries others"],
 )
 def test_a_proposal_fixes_a_grippers_fingers(logged, right, fixed, tmp_path):
     proposal = propose_scene(
@@ -160,10 +162,14 @@ def test_a_proposal_fixes_a_grippers_fingers(logged, right, fixed, tmp_path):
     kinds = [f.kind for f in proposal.findings()]
     assert FIXED in kinds and set(kinds) <= {FIXED, "effort_unexplained"}
     (sidecar,) = proposal.sidecars.values()
-    assert sidecar.count("taken to stand still") == (2 if "left" in logged else 0)
+    assert sidecar.count("taken to stand still") == len({"left", "right"} & {*logged})
     path = tmp_path / "proposed.yaml"
     path.write_text(proposal.scene)
-    assert SceneDynamics(read_scene(path)).plant.num_velocities() == 2
+    proposed = read_scene(path)
+    if FOLLOWS in right:
+        left, follows = (proposed.fixed_joints[f"arm.{j}"] for j in ("left", "right"))
+        assert left > 0.2 and follows == pytest.approx(0.2 - 0.5 * left, abs=1e-5)
+    assert SceneDynamics(proposed).plant.num_velocities() == 2
 
 
 def test_coupled_joints_that_carry_others_are_refused(tmp_path):

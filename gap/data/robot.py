@@ -70,7 +70,7 @@ from makebreak.gap.data.units import DEG, FULL_RANGE, in_units, said_of_units
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.joints import ROTOR
 from makebreak.models.effects.kind import actuator_of, one_dof_joints
-from makebreak.models.fixed_joints import couplings_in, fix_joints
+from makebreak.models.fixed_joints import couplings_in, fix_joints, followers_in
 from makebreak.models.model_files import checked_inertias, without_lost_collisions
 from makebreak.models.model_inertias import ModelText, mended
 from makebreak.models.robot_file import FileDrive, RobotFile
@@ -230,12 +230,12 @@ def _standing(robot: Robot, every, logs, some_unknown: bool) -> dict[str, float]
     Raises: ValueError for coupled joints that carry others.
     """
     coupled = {
-        f"{robot.model}.{one}": f"{robot.model}.{other}"
-        for one, other in couplings_in(robot.file.text).items()
+        f"{robot.model}.{one}": replace(of, joint=f"{robot.model}.{of.joint}")
+        for one, of in followers_in(robot.file.text).items()
     }
     scaled = [_scaled(log, every[log.path]) for log in logs]
     seen = {name.rpartition(".")[0] for channels in scaled for name in channels}
-    follow = {*coupled, *coupled.values()}
+    follow = {*coupled, *(of.joint for of in coupled.values())}
     found = {}
     for joint in robot.joints:
         if joint.name in seen and joint.name not in follow:
@@ -253,9 +253,15 @@ def _standing(robot: Robot, every, logs, some_unknown: bool) -> dict[str, float]
              if f"{joint.name}.position" in c]  # fmt: skip
         home = robot.file.home.get(joint.name.partition(".")[2], 0.0)
         middle = float(np.nanmedian(np.concatenate(q))) if q else home
-        found[joint.name] = float(
-            f"{np.clip(np.nan_to_num(middle), joint.lower, joint.upper):.6g}"
-        )
+        found[joint.name] = middle
+    for name, of in coupled.items():  # Where its leader has it, if nobody saw it.
+        if name in found and name not in seen and of.joint in found:
+            found[name] = of.factor * found[of.joint] + of.offset
+    limits = {joint.name: (joint.lower, joint.upper) for joint in robot.joints}
+    found = {
+        name: float(f"{np.clip(np.nan_to_num(q), *limits[name]):.6g}")
+        for name, q in found.items()
+    }
     return found if len(found) < len(robot.joints) else {}
 
 
