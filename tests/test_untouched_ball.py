@@ -143,7 +143,7 @@ def test_a_ball_that_rolls_away_is_aimed_uphill_of_the_path(slope):
     told = system.GetOutputPort("downhill").Eval(context)
     np.testing.assert_allclose(told, [0.0, slope], atol=0.006)
     target = system.GetOutputPort("x_desired").Eval(context).reshape(6, -1)[0, P_BALL]
-    lead = np.pi / 2 + np.deg2rad(Config().lead_deg)
+    lead = np.pi / 2 + np.deg2rad(Config().circle.lead_deg)
     on_path = np.array([0.5, 0.0]) + 0.1 * np.array([np.cos(lead), np.sin(lead)])
     aside = UPHILL * known.coast_sec**2 * told[1]
     assert aside == pytest.approx(0.0086 if slope else 0.0, abs=0.001)

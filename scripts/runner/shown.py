@@ -40,9 +40,8 @@ def show(table: Table, shown: Table | None = None) -> None:
 
 
 def terminal_width() -> int | None:
-    """Of the terminal, or as COLUMNS says [characters]; None of a file or a pipe."""
-    known = sys.stdout.isatty() or "COLUMNS" in os.environ
-    return get_terminal_size().columns if known else None
+    """Of the terminal [characters]; None of a file or a pipe."""
+    return get_terminal_size().columns if sys.stdout.isatty() else None
 
 
 def tell(**facts: Any) -> None:
