@@ -229,6 +229,17 @@ def shows_in_equations_alone(gap: GapMeasure) -> bool:
     return gap.window_s > 0.0 and gap.after <= AGREEMENT_RMS_MAX
 
 
+def below_noise(choices: Sequence[Choice], start: float, gap: GapMeasure) -> str:
+    """A sentence where effects are named though no error is larger than it may be."""
+    if not choices or max(start, gap.before) > AGREEMENT_RMS_MAX:
+        return ""
+    it = "them" if len(choices) > 1 else "it"
+    return (
+        f" The error without {it} is no larger than noise and an uncertain start "
+        f"allow; all data together leave no doubt of {it}."
+    )
+
+
 def two_figures(
     start: float, end: float, gap: GapMeasure, by_equations: bool = True
 ) -> str:

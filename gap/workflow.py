@@ -109,6 +109,7 @@ from makebreak.gap.thresholds import (
 )
 from makebreak.gap.verdict import (
     Facts,
+    below_noise,
     decide,
     named,
     says,
@@ -742,6 +743,7 @@ def conclude(
     near += _says_failure(final.gap)
     if verdict != "gap_unnamed" or not shows_in_equations_alone(final.gap):
         near += two_figures(facts.start, facts.end, final.gap, problem.by_equations)
+    near += below_noise(selection.choices, facts.start, final.gap)
     near += drifting
     # Nothing was learned from it: the part that is reported on is looked at last.
     where = [] if verdict in AGREES else [

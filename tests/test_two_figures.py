@@ -13,7 +13,9 @@ from makebreak.gap.residuals.objects import (
 )
 from makebreak.gap.residuals.pressing import PressingProblem
 from makebreak.gap.result import GapMeasure, NamedEffect
-from makebreak.gap.verdict import says, two_figures
+from makebreak.gap.search.choice import Choice
+from makebreak.gap.verdict import below_noise, says, two_figures
+from makebreak.models.effects.kind import Effect
 
 
 def measure(before: float, after: float, window_s: float = 0.3) -> GapMeasure:
@@ -119,3 +121,15 @@ def test_which_problems_are_of_equations():
 )
 def test_how_the_held_out_error_goes_is_said(before, after, goes):
     assert goes in says("gap_named", [], measure(before, after))
+
+
+def test_what_is_below_the_noise_is_said_to_be():
+    """Only where something is named, and no error is larger than it may be."""
+    effect = Effect("object_mass", ["a.box"], {"mass": 1.0})
+    named = Choice(effect, {}, 1.0, 0.9, "", 0.0, (), (), 1)
+    below = measure(0.85, 0.78)
+    assert "without it is no larger than noise" in below_noise([named], 0.96, below)
+    assert "without them" in below_noise([named, named], 0.96, below)
+    assert below_noise([], 0.96, below) == ""
+    assert below_noise([named], 2.0, below) == ""
+    assert below_noise([named], 0.96, measure(3.0, 0.78)) == ""
