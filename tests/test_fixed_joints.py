@@ -144,10 +144,24 @@ def test_couplings_are_read_from_every_format(suffix, text, tmp_path):
         (["shoulder", "elbow"], "", "{arm.left: 0, arm.right: 0}"),
         (["shoulder", "elbow", "left", "right"], MIMIC, "{arm.left: 0.3"),
         (["shoulder", "elbow", "left"], MIMIC.replace('"1"', FOLLOWS), "{arm.left: "),
+        # What was seen counts.
+        (
+            ["shoulder", "elbow", "left", "right"],
+            MIMIC.replace('"1"', FOLLOWS),
+            "{arm.left: 0.3",
+        ),
         (["shoulder", "elbow", "left", "right"], "", None),
         (["elbow", "left", "right"], "", None),  # Where the shoulder is nobody knows.
     ],
-    ids=["not logged", "no mimic", "mimic", "one logged", "free", "carries others"],
+    ids=[
+        "not logged",
+        "no mimic",
+        "mimic",
+        "one logged",
+        "all logged",
+        "free",
+        "carries others",
+    ],
 )
 def test_a_proposal_fixes_a_grippers_fingers(logged, right, fixed, tmp_path):
     proposal = propose_scene(
@@ -168,7 +182,9 @@ def test_a_proposal_fixes_a_grippers_fingers(logged, right, fixed, tmp_path):
     proposed = read_scene(path)
     if FOLLOWS in right:
         left, follows = (proposed.fixed_joints[f"arm.{j}"] for j in ("left", "right"))
-        assert left > 0.2 and follows == pytest.approx(0.2 - 0.5 * left, abs=1e-5)
+        seen = "right" in logged
+        expected, off = (0.3, 0.05) if seen else (0.2 - 0.5 * left, 1e-5)
+        assert left > 0.2 and follows == pytest.approx(expected, abs=off)
     assert SceneDynamics(proposed).plant.num_velocities() == 2
 
 

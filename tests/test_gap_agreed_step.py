@@ -11,9 +11,10 @@ from makebreak.gap.fit import MOST_FREE, fit_effects, search_by_blocks
 from makebreak.gap.numerics.agreed_step import agreed_step
 from makebreak.gap.problem import GapProblem, Nuisances, SearchPlan, rms
 from makebreak.gap.residuals.impacts import candidates_of
-from makebreak.gap.search import trials
+from makebreak.gap.search import add, trials
 from makebreak.gap.search.by_simulation import ranked_by_simulation
 from makebreak.gap.search.comparison import Comparison
+from makebreak.gap.search.rivals import Rivals
 from makebreak.gap.search.screen import rank
 from makebreak.gap.search.select import select
 from makebreak.gap.search.trials import fit_each
@@ -237,3 +238,15 @@ def test_many_parameters_are_not_fitted_after_few_that_leave_clearly_less():
     assert ["b"] not in asked
     fit_each(search, screen, (), [good, few])
     assert ["b"] in asked
+
+
+@pytest.mark.parametrize("counts", [True, False])
+def test_nothing_is_added_where_groups_lose_all_members(counts, monkeypatch):
+    """What ranks candidates may leave none."""
+    problem = Bends(5.0)
+    problem.plan = replace(problem.plan, counts_evidence=counts)
+    monkeypatch.setattr(add, "with_pruned_groups", lambda *args: [])
+    search = Comparison(problem, lambda text: None)
+    found = problem.candidates(search.nuisances, search.start)
+    step = add.add_next(search, Rivals(search), found, (), search.start)
+    assert step.fitted is None and not step.added

@@ -1,6 +1,7 @@
 """Objects in a model's own file (MJCF here): their poses, and lists of coordinates."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from makebreak.gap.data.robot import Log, propose_scene, read_robot
 from makebreak.gap.data.table import RecordingTable
 from makebreak.gap.residuals import in_mujoco
 from makebreak.gap.residuals.contact_problem import ContactProblem
+from makebreak.gap.simulation.windows import Window
 from makebreak.gap.thresholds import AGREEMENT_RMS_MAX
 from makebreak.gap.workflow import run_gap
 from makebreak.models.dynamics import SceneDynamics
@@ -290,6 +292,31 @@ def test_friction_of_a_pair_is_mujocos(tmp_path):
     for pair, friction in (("w.floor", 1.0), ("w.pusher", 0.4)):
         now = dynamics.now("contact_friction", [f"w.crate~{pair}"])
         assert now["friction"] == pytest.approx(friction)
+
+
+@pytest.mark.parametrize(("row", "times"), [(120, 1.0), (220, 25.0)])
+def test_a_start_beside_an_impact_is_less_sure_than_smoothing_says(row, times):
+    """Of an episode that begins at row 100: what was measured there is a deviation off
+    the smoothed motion, and five from the 110th row after its first on."""
+    first, noise = 100, 1e-3
+    off = np.where(np.arange(250) < first + 110, noise, 5.0 * noise)
+    path = {"a.box.x": np.zeros((150, 3))}
+
+    class Log(dict):
+        channels = {"a.box.x": SimpleNamespace(noise=noise)}
+
+        def episode_at(self, row):
+            return SimpleNamespace(first=first, rows=slice(first, 250))
+
+    problem = SimpleNamespace(
+        recordings=[Log({"a.box.x": off})], _paths={(0, 100): path}
+    )
+    w = Window(
+        0, 0, 1.0, slice(row, row + 20), {}, np.ones((20, 1)), True,
+        {"a.box.x": np.eye(2)},
+    )  # fmt: skip
+    wider = in_mujoco.MujocoProblem._as_smoothed(problem, w)  # type: ignore[arg-type]
+    np.testing.assert_allclose(wider.spread["a.box.x"], times * np.eye(2))
 
 
 def test_starts_at_random_have_the_covariance_of_all_axes(tmp_path, monkeypatch):

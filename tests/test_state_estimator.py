@@ -265,6 +265,10 @@ def test_a_fault_spoils_the_window_until_it_has_left_it(bench, fault):
     assert window_valid() == 0.0
     bench.tick()
     assert window_valid() == 1.0
+    bench.tick()  # Readings beyond the window's are not counted.
+    states = bench.context.get_discrete_state()
+    every = (states.get_vector(i).value() for i in range(states.num_groups()))
+    assert [x[-1] for x in every if x.size == 3 * N_WINDOW + 1] == [N_WINDOW]
 
 
 @pytest.mark.parametrize("name", ["ball_radius", "tip_mass"])

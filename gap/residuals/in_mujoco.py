@@ -8,7 +8,7 @@ what contacts that chatter do by chance.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -60,7 +60,6 @@ class MujocoProblem(WindowModel, WindowedProblem):
         jumps=True, alike=True, loud=UNEXPLAINED_RMS, counts_evidence=True,
     )  # fmt: skip
 
-    one_size = True
     simulation: MujocoSimulation
 
     def __init__(
@@ -81,7 +80,6 @@ class MujocoProblem(WindowModel, WindowedProblem):
         self.windows = [self._as_smoothed(w) for w in self.windows]
         self._weighed_by: tuple = ()
         self._in_parts = False
-        self._pairs_met: set[str] | None = None
         if commands_late is not None:
             self.set_commands_late(commands_late)
         self._weigh(())
@@ -291,10 +289,13 @@ class MujocoProblem(WindowModel, WindowedProblem):
         """Of pairs those that meet, links of a robot among them."""
         if KINDS[kind].at != "pair":
             return super().places_of(kind)
-        if self._pairs_met is None:
-            with self.simulation.noting_pairs() as self._pairs_met:
-                self.simulate(())
-        return sorted(self._pairs_met)
+        return self._pairs_met
+
+    @cached_property
+    def _pairs_met(self) -> list[str]:
+        with self.simulation.noting_pairs() as met:
+            self.simulate(())
+        return sorted(met)
 
     def candidates(self, nuisances: Nuisances, current: Fitted) -> list[Candidate]:
         found = super().candidates(nuisances, current)

@@ -93,14 +93,13 @@ class WindowedProblem(GapProblem):
     """What problems of simulated windows share."""
 
     by_equations = False
-    one_size = False  # Of a pair's values that is tried.
 
     def nuisances(self) -> Nuisances:
         return contact_nuisances(self._model())
 
     def candidates(self, nuisances: Nuisances, current: Fitted) -> list[Candidate]:
         return contact_candidates(
-            self._model(), current.effects, current.r, self.one_size
+            self._model(), current.effects, current.r, self.plan.counts_evidence
         )
 
     def judged(self) -> dict[str, str]:

@@ -72,11 +72,10 @@ def add_next(
     screen = search.screen(current.r, scale)
     base = screen.evaluate(current.r)
     ranked = with_pruned_groups(search, wide, ranked)
-    clear = search.plan.by_channel or ranked[0].fit.score <= _CLEAR_GAIN * base.score
-    if search.plan.counts_evidence and ranked:
+    by_evidence = search.plan.counts_evidence
+    if by_evidence and ranked:
         found_by = ranked_by_simulation(search, wide, ranked, chosen, current)
         ranked = [r for evidence, r in found_by if evidence > EVIDENCE_MIN]
-        clear = bool(ranked)
     table = tuple(
         Considered(
             r.candidate.kind, tuple(r.candidate.at),
@@ -86,12 +85,11 @@ def add_next(
     )  # fmt: skip
     none = Step((), None, table)
     by_model = search.problem.weighed_by([c.effect for c in chosen]) is not None
-    short = shortlist(
-        ranked, base.score, search.plan.shortlist, by_model, search.plan.counts_evidence
-    )
+    short = shortlist(ranked, base.score, search.plan.shortlist, by_model, by_evidence)
     if not short:
         return none
-    if not clear:
+    by_score = not (search.plan.by_channel or by_evidence)
+    if by_score and ranked[0].fit.score > _CLEAR_GAIN * base.score:
         return none
     screen, trials = _fitted_exactly(search, scale, chosen, current, short)
     if not trials:
