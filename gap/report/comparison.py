@@ -315,7 +315,7 @@ def _draw(
     if seen:
         low, high = np.min(seen, axis=0), np.max(seen, axis=0)
         target = 0.5 * (low + high)
-        away = 0.55 * max(float(np.linalg.norm(high - low)), 0.4)
+        away = 0.75 * max(float(np.linalg.norm(high - low)), 0.4)
         meshcat.SetCameraPose(target + away * _side(target, behind), target)
 
 
