@@ -74,7 +74,6 @@ from makebreak.gap.residuals.objects import (
     RolloutProblem,
     TouchProblem,
     point_on_face_of,
-    smooth_surface_of,
 )
 from makebreak.gap.residuals.pressing import PressingProblem, presses, push_each_other
 from makebreak.gap.residuals.sap_lift import sap_lift
@@ -513,7 +512,7 @@ def problem_for(
             pass
     try:
         flight = FlightProblem(scene, recordings, dynamics=dynamics)
-        return flight, point_on_face_of(flight) + smooth_surface_of(flight)
+        return flight, point_on_face_of(flight)
     except DoesNotFit:  # More than one free body, or other shapes: by Drake's steps.
         scene, finding = _settle_step(scene, recordings, dynamics, jobs)
         return RolloutProblem(scene, recordings), finding

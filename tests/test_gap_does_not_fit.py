@@ -39,8 +39,7 @@ def with_problems(monkeypatch, first_that_fits, order, error=DoesNotFit):
     monkeypatch.setattr(workflow, "without_contact", lambda *_: ([], []))
     monkeypatch.setattr(workflow, "without_shapes", lambda scene: scene)
     monkeypatch.setattr(workflow, "_settle_step", lambda scene, *_: (scene, []))
-    for name in ("sap_lift", "point_on_face", "point_on_face_of", "smooth_surface_of",
-                 "set_command_times"):  # fmt: skip
+    for name in ("sap_lift", "point_on_face", "point_on_face_of", "set_command_times"):
         monkeypatch.setattr(workflow, name, lambda *_: [])
     return workflow.problem_for(None, [], SimpleNamespace(plant=None))
 

@@ -12,14 +12,11 @@ from scipy.spatial.transform import Rotation
 from makebreak.gap import run_gap
 from makebreak.gap.data.check_meshes import check_meshes
 from makebreak.gap.data.reading import read_recordings
-from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.fit import fit_effects
 from makebreak.gap.numerics.edge_crossings import FAR, crossing, edges_of_box
-from makebreak.gap.numerics.free_body import FreeBody, nearest, simulate
-from makebreak.gap.residuals.contact import contact_nuisances
+from makebreak.gap.numerics.free_body import FreeBody, simulate
 from makebreak.gap.residuals.contact_dynamics import ContactDynamics
 from makebreak.gap.residuals.contact_problem import ContactProblem
-from makebreak.gap.residuals.objects import FlightProblem, smooth_surface_of
 from makebreak.gap.residuals.pressing import PressingProblem
 from makebreak.gap.residuals.touching import BESIDE, MEETS
 from makebreak.gap.result import GapMeasure
@@ -27,7 +24,6 @@ from makebreak.gap.search.choice import Choice
 from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.search.screen import rank
 from makebreak.gap.simulation.contact_shapes import ContactShapes
-from makebreak.gap.simulation.free_windows import settled
 from makebreak.gap.verdict import Facts, decide
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import load_scene, read_scene
@@ -401,105 +397,3 @@ def test_what_is_hidden_in_the_large_is_named_first(tmp_path, scene, hide, seed)
     assert result.effects and result.effects[0].kind == effect["kind"]
     for name, value in effect["parameters"].items():
         assert result.effects[0].parameters[name].value == pytest.approx(value, rel=0.1)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("scene, seed", [("bowl", 41), ("bowl_mesh", 321)])
-def test_rolling_resistance_in_a_bowl_is_named(tmp_path, scene, seed):
-    """At every edge between plates the scene's own simulation knocks."""
-    [effect] = large_scenes.write(scene, "rolling", seed, tmp_path)
-    result = found_in(tmp_path)
-    assert result.verdict in ("gap_named", "ambiguous")  # Drag slows it nearly so.
-    [found] = result.effects
-    assert (found.kind, found.at) == (effect["kind"], (effect["at"],))
-    value = effect["parameters"]["coefficient"]
-    assert found.parameters["coefficient"].value == pytest.approx(value, rel=0.05)
-    assert [c.kind for c in result.checks].count("smooth_surface") == 1
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("scene, seed", [("bowl_fine", 310), ("bowl_mesh", 320)])
-def test_in_a_right_bowl_nothing_is_found(tmp_path, scene, seed):
-    large_scenes.write(scene, "", seed, tmp_path)
-    result = found_in(tmp_path)
-    assert (result.verdict, result.effects) == ("no_gap", [])
-
-
-# ----- A ball in a bowl
-
-
-@pytest.fixture(
-    scope="module",
-    params=[pytest.param("bowl_fine", marks=pytest.mark.slow), "bowl_mesh"],
-)
-def bowl(request, tmp_path_factory):
-    """Its folder, and the model of a right bowl of plates, or of a mesh."""
-    folder = tmp_path_factory.mktemp(request.param)
-    large_scenes.write(request.param, "", 330, folder)
-    scene = read_scene(folder / "scene.yaml")
-    return folder, FlightProblem(scene, read_recordings([folder / "recording.csv"]))
-
-
-def test_a_ball_that_rolls_in_a_bowl_starts_on_it(bowl):
-    """Where it is seen to be is 0.3 mm off; it is 0.02 mm deep."""
-    folder, model = bowl
-    body, off = model.free_bodies.each[0], []
-    for w in model.windows:
-        place, velocity = w.state[4:, 0], w.state[4:, 1]
-        at, v = settled(body, place, velocity, w.state[4:, 2])
-        gap, normal, _ = nearest(body, np.array([1.0, 0, 0, 0, *at]))
-        assert -2e-4 < gap < 0.0 and abs(v @ normal) < 1e-6
-        assert np.linalg.norm(at - place) < 1e-3
-        off.append(np.linalg.norm(at - place))
-        # One that falls is where it is seen.
-        free = settled(body, place, velocity, body.gravity)
-        np.testing.assert_array_equal(free[0], place)
-        np.testing.assert_array_equal(free[1], velocity)
-    assert max(off) > 2e-5
-    left = np.concatenate(model.errors(model.simulate()))
-    assert np.sqrt(np.mean(left**2)) < 1.2
-
-
-def test_the_faces_that_stand_for_a_bowl_are_told(bowl):
-    folder, model = bowl
-    [finding] = smooth_surface_of(model)
-    assert (finding.kind, finding.severity) == ("smooth_surface", "warning")
-    assert "bowl.bowl" in finding.says and "knocks" in finding.says
-    assert finding.size < 6.0
-    assert "Model it with finer faces" in model.hint(None)
-
-
-def test_a_ball_at_a_mesh_s_edge_is_left_to_drake(tmp_path):
-    large_scenes.write("bowl_mesh", "", 330, tmp_path)
-    log = tmp_path / "recording.csv"
-    lines = log.read_text().splitlines()
-    names = lines[0].split(",")
-    x, z = names.index("ball.ball.x"), names.index("ball.ball.z")
-    mesh = (tmp_path / "bowl.obj").read_text().splitlines()
-    rim = np.array([line.split()[1:] for line in mesh if line[0] == "v"], float)
-    for k in range(1, 200):  # On its rim.
-        row = lines[k].split(",")
-        row[x], row[names.index("ball.ball.y")] = f"{rim[:, 0].max()}", "0"
-        row[z] = f"{rim[:, 2].max() + 0.01}"
-        lines[k] = ",".join(row)
-    log.write_text("\n".join(lines) + "\n")
-    with pytest.raises(DoesNotFit, match="an edge of a mesh"):
-        FlightProblem(read_scene(tmp_path / "scene.yaml"), read_recordings([log]))
-
-
-def test_a_tenth_of_a_millimetre_is_no_gap_of_what_rolls(bowl):
-    """How well shapes are known is a nuisance parameter, as where things are pushed."""
-    folder, model = bowl
-    nuisances = contact_nuisances(model)
-    k = nuisances.names.index("shape of ball.ball")
-    radius = float(model.free_bodies.each[0].spheres[0, 3])
-    off = Effect("object_size", ["ball.ball"], {"radius": radius + 1e-4})
-    r = model.residual([off])
-    before = float(np.sum((model.base() - r) ** 2))
-    left = model.base() - r - 1e-4 * nuisances.columns[:, k]
-    assert float(np.sum(left**2)) < 0.05 * before and nuisances.prior[k] == 2e-4
-    # The ground's: a ball that is so much higher is as far off all the time.
-    r = model.moved_out(1e-4)
-    left = model.base() - r - 1e-4 * nuisances.columns[:, k + 1]
-    assert float(np.sum(left**2)) < 0.05 * float(np.sum((model.base() - r) ** 2))
-    assert nuisances.names[k + 1] == "shape of what is rolled on"

@@ -18,23 +18,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numba import njit
 
-from makebreak.gap.numerics import smooth_faces
-from makebreak.gap.numerics.smooth_faces import MESH, WIDE, SmoothFaces
-
 EDGE, FACE = 1.0, 2.0
 # Sine of the angle from a cylinder's axis to the normal of what it touches, between
 # which its face gives way to its edge; and that of the side's angle to it below which
 # the edges of both ends begin to share the load.
 LEAN, SIDE = (0.1, 0.3), 0.1
 MOST_STEPS = 40_000  # Of one run: beyond it the parameters are given up.
-FEW = 12  # Fixed shapes of which each is looked at, always.
-AROUND = 5e-3  # [m] Else those that a sphere has within this, until it has moved by it.
-MOST_ON = 4  # Smooth surfaces that a sphere touches at once,
-STAYS = 2e-4  # which are fitted anew once it has moved by this [m].
-OVER = 1.1  # Of a face's half sizes: so far out a sphere is over its surface,
-BESIDE = 0.8  # of a mesh's spacing, from the nearest vertex.
-FAR = 1e9  # [m]
-ALIKE = 0.85  # Cosine: a contact with a face whose smooth surface is touched so, too.
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,8 +32,7 @@ class FreeBody:
 
     spheres (n, 4): centre in the body's frame and radius [m]. fixed (m, 15): rotation
     (9, by rows) and centre (3) in world, half sizes (3) [m]; a half-space has its
-    origin on its surface and a first half size of -1; a mesh has one of -2, and what is
-    smooth of it is all that touches. pairs (n, m, 6): stiffness [N/m],
+    origin on its surface and a first half size of -1. pairs (n, m, 6): stiffness [N/m],
     dissipation [s/m], static and dynamic friction, the share of the contact point that
     lies on the sphere's surface, and a linear damper [N s/m]. levers (n, m): of rolling
     resistance [m].
@@ -54,8 +42,7 @@ class FreeBody:
     the spheres that stand in for a cylinder: its axis (3), the radius of a circle about
     the sphere's centre [m], and what the sphere is: EDGE touches with the point of the
     circle that is farthest along a normal which is across the axis, FACE where the
-    normal is along the axis; 0: a sphere as it is. smooth: the faces of fixed
-    shapes that stand for curved surfaces, which spheres touch in their place.
+    normal is along the axis; 0: a sphere as it is.
     """
 
     mass: float
@@ -72,7 +59,6 @@ class FreeBody:
     fade: float = 0.05  # Below this rate rolling resistance fades [rad/s].
     patches: np.ndarray = field(default_factory=lambda: np.zeros((0, 6)))
     rims: np.ndarray | None = None
-    smooth: SmoothFaces = field(default_factory=smooth_faces.none)
 
     def __post_init__(self):
         shape = (len(self.spheres), len(self.fixed), 6)
@@ -139,7 +125,6 @@ def simulate_all(
 ) -> np.ndarray:
     """(n, n_bodies, 13); start (n_bodies, 13), the rest as of simulate()."""
     each = bodies.each
-    middles, of_smooth, surfaces = _smooth(each[0])
     count = [len(body.spheres) for body in each]
 
     def owned(rows, width: int) -> np.ndarray:
@@ -161,21 +146,12 @@ def simulate_all(
         bodies.boxes, bodies.carried,
         owned([body.forces for body in each], 6),
         np.array([body.drag for body in each]), each[0].slip, each[0].fade,
-        owned([body.patches for body in each], 6), middles, of_smooth, surfaces,
-        max_step, tol,
+        owned([body.patches for body in each], 6), max_step, tol,
     )  # fmt: skip
 
 
 def _rims(body: FreeBody) -> np.ndarray:
     return np.zeros((len(body.spheres), 5)) if body.rims is None else body.rims
-
-
-def _smooth(body: FreeBody) -> tuple:
-    """Middle, normal, spacing and bend (S, 8) of smooth faces, the surface and the
-    fixed shape of each (S, 2), and surfaces of boxes' faces (m, 6)."""
-    s = body.smooth
-    middles = np.column_stack([*s.placed(body.fixed), s.spacing, s.bend])
-    return middles, np.column_stack([s.surface, s.of]), s.surfaces
 
 
 def placed(pose, points) -> np.ndarray:
@@ -212,32 +188,16 @@ def gaps_and_normals(body: FreeBody, pose) -> np.ndarray:
     """(n, m, 4) distance [m] and normal of each sphere to each fixed shape."""
     R, p = _matrix(np.asarray(pose[:4], float)), np.asarray(pose[4:7], float)
     centres = p + body.spheres[:, :3] @ R.T
-    return _gaps(centres, body.spheres[:, 3], body.fixed, _rims(body), *_smooth(body))
+    return _gaps(centres, body.spheres[:, 3], body.fixed)
 
 
 @njit(cache=True)
-def _gaps(centres, radii, fixed, rims, smooth, of_smooth, surfaces):
+def _gaps(centres, radii, fixed):
     out = np.empty((len(centres), len(fixed), 4))
-    around, middles, at, counts, fits = _looks(len(centres), len(fixed), len(smooth))
-    on = np.empty((MOST_ON, 6))
     for j in range(len(centres)):
         c0, c1, c2 = centres[j]
         for m in range(len(fixed)):
             out[j, m] = _gap(c0, c1, c2, radii[j], fixed[m])
-        count = 0
-        if len(smooth) and rims[j, 4] == 0.0:
-            _look(j, c0, c1, c2, radii[j], 0.0, fixed, smooth, around, middles, at)
-            count = _on_smooth(
-                j, c0, c1, c2, radii[j], fixed, smooth, of_smooth, surfaces, around,
-                middles, at, counts, fits, on,
-            )  # fmt: skip
-        for m in range(len(fixed)):
-            k = _stands_for(m, out[j, m, 1], out[j, m, 2], out[j, m, 3], surfaces, on,
-                            count)  # fmt: skip
-            if k >= 0:  # Never nearer than the surface itself.
-                out[j, m, 0] = max(out[j, m, 0], on[k, 2] + 1e-9)
-        for k in range(count):
-            out[j, int(on[k, 1])] = on[k, 2:]
     return out
 
 
@@ -258,8 +218,6 @@ def _matrix(q):
 def _is_apart(c0, c1, c2, radius, fixed):
     """Whether a sphere is outside of a fixed shape: beyond one of its faces. What is
     near an edge is left to _gap."""
-    if fixed[12] == MESH:
-        return True
     d0, d1, d2 = c0 - fixed[9], c1 - fixed[10], c2 - fixed[11]
     a2 = fixed[2] * d0 + fixed[5] * d1 + fixed[8] * d2
     if fixed[12] < 0.0:
@@ -273,10 +231,7 @@ def _is_apart(c0, c1, c2, radius, fixed):
 
 @njit(cache=True)
 def _gap(c0, c1, c2, radius, fixed):
-    """Distance of a sphere to a fixed shape, and the normal (3) out of the shape; to a
-    mesh, which is none but a smooth surface, FAR."""
-    if fixed[12] == MESH:
-        return FAR, 0.0, 0.0, 1.0
+    """Distance of a sphere to a fixed shape, and the normal (3) out of the shape."""
     d0, d1, d2 = c0 - fixed[9], c1 - fixed[10], c2 - fixed[11]
     # In the shape's axes.
     a0 = fixed[0] * d0 + fixed[3] * d1 + fixed[6] * d2
@@ -385,143 +340,6 @@ def _press(F, T, s, b, p0, p1, p2, depth, n0, n1, n2, radius, share_of, j, m, pa
         T[b, 2] -= lever * fn / turn * t2
 
 
-@njit(cache=True)
-def _looks(n, m, S):
-    """Of n spheres: how many of m fixed shapes are near and which
-    (n, 1 + m), the same of S middles of smooth faces, and from where it looked,
-    at shapes and at surfaces (n, 6); how many surfaces it is on (n,), and of each its
-    number, the shape of the face that it is over most, and its fit (n, MOST_ON, 7)."""
-    around, middles = np.zeros((n, 1 + m), np.int64), np.zeros((n, 1 + S), np.int64)
-    fits = np.zeros((n, MOST_ON, 7))
-    return around, middles, np.full((n, 6), np.inf), np.zeros(n, np.int64), fits
-
-
-@njit(cache=True)
-def _look(j, c0, c1, c2, radius, rim, fixed, smooth, around, middles, at):
-    """Looks around sphere j, unless it has done so and has moved by little since.
-    Returns: how many fixed shapes are near."""
-    d0, d1, d2 = c0 - at[j, 0], c1 - at[j, 1], c2 - at[j, 2]
-    if d0 * d0 + d1 * d1 + d2 * d2 < AROUND * AROUND:
-        return around[j, 0]
-    at[j, 0], at[j, 1], at[j, 2] = c0, c1, c2
-    count = 0
-    for m in range(len(fixed)):
-        if _gap(c0, c1, c2, radius + rim, fixed[m])[0] < AROUND:
-            count += 1
-            around[j, count] = m
-    around[j, 0] = count
-    some = 0
-    for i in range(len(smooth)):
-        d0 = smooth[i, 0] + radius * smooth[i, 3] - c0
-        d1 = smooth[i, 1] + radius * smooth[i, 4] - c1
-        d2 = smooth[i, 2] + radius * smooth[i, 5] - c2
-        reach = smooth_faces.width(smooth[i, 6], smooth[i, 7], radius) + AROUND
-        if d0 * d0 + d1 * d1 + d2 * d2 < reach * reach:
-            some += 1
-            middles[j, some] = i
-    middles[j, 0] = some
-    return count
-
-
-@njit(cache=True)
-def _on_smooth(j, c0, c1, c2, radius, fixed, smooth, of_smooth, surfaces, around,
-               middles, at, counts, fits, on):  # fmt: skip
-    """Smooth surfaces with a face that sphere j is over. Writes of each (on) its
-    number, the shape of the face that it is over most, its distance and normal.
-    Returns: how many."""
-    d0, d1, d2 = c0 - at[j, 3], c1 - at[j, 4], c2 - at[j, 5]
-    if not d0 * d0 + d1 * d1 + d2 * d2 < STAYS * STAYS:
-        counts[j] = _fit_smooth(j, c0, c1, c2, radius, fixed, smooth, of_smooth,
-                                surfaces, around, middles, fits[j])  # fmt: skip
-        at[j, 3], at[j, 4], at[j, 5] = c0, c1, c2
-        d0 = d1 = d2 = 0.0
-    for k in range(counts[j]):
-        on[k, 0], on[k, 1] = fits[j, k, 0], fits[j, k, 1]
-        gap, n0, n1, n2 = smooth_faces.distance(d0, d1, d2, fits[j, k])
-        on[k, 2], on[k, 3], on[k, 4], on[k, 5] = gap, n0, n1, n2
-    return counts[j]
-
-
-@njit(cache=True)
-def _fit_smooth(j, c0, c1, c2, radius, fixed, smooth, of_smooth, surfaces, around,
-                middles, fits):  # fmt: skip
-    """Writes and counts the smooth surfaces that sphere j is on: as in _looks()."""
-    count = 0
-    for each in range(around[j, 0]):
-        m = around[j, 1 + each]
-        axis, side, beside = _over(c0, c1, c2, fixed[m])
-        number = surfaces[m, 2 * axis + side] if axis >= 0 else -1
-        if number >= 0 and beside < OVER:
-            count = _found(number, m, beside / OVER, fits, count)
-    for each in range(middles[j, 0]):
-        i = middles[j, 1 + each]
-        number, m = of_smooth[i]
-        if fixed[m, 12] == MESH:
-            n0, n1, n2 = smooth[i, 3], smooth[i, 4], smooth[i, 5]
-            d0, d1, d2 = c0 - smooth[i, 0], c1 - smooth[i, 1], c2 - smooth[i, 2]
-            up = d0 * n0 + d1 * n1 + d2 * n2
-            d0, d1, d2 = d0 - up * n0, d1 - up * n1, d2 - up * n2
-            reach = smooth_faces.width(smooth[i, 6], smooth[i, 7], radius) / WIDE
-            beside = np.sqrt(d0 * d0 + d1 * d1 + d2 * d2) / (BESIDE * reach)
-            if beside < 1.0 and up > 0.0:  # Else it is on the other side.
-                count = _found(number, m, beside, fits, count)
-    kept = 0
-    for k in range(count):
-        fits[kept, 0], fits[kept, 1] = fits[k, 0], fits[k, 1]
-        if smooth_faces.fit(c0, c1, c2, radius, smooth, of_smooth, middles[j],
-                            fits[kept]):  # fmt: skip
-            kept += 1
-    return kept
-
-
-@njit(cache=True)
-def _found(number, m, beside, fits, count):
-    """Notes the face of shape m as one of surface `number`, if it is the one that a
-    sphere is over most. Returns: how many surfaces there are now."""
-    k = 0
-    while k < count and fits[k, 0] != number:
-        k += 1
-    if k == count and count < MOST_ON:
-        fits[k, 0], fits[k, 1], fits[k, 2] = number, m, beside
-        count += 1
-    elif k < count and beside < fits[k, 2]:
-        fits[k, 1], fits[k, 2] = m, beside
-    return count
-
-
-@njit(cache=True)
-def _over(c0, c1, c2, box):
-    """Axis and side (0, 1) of the face of a box that a point is farthest out of, and
-    how far it is from the face's middle, across, over its half sizes; axis -1: of a
-    half-space."""
-    if box[12] < 0.0:
-        return -1, 0, 0.0
-    d0, d1, d2 = c0 - box[9], c1 - box[10], c2 - box[11]
-    axis, side, most = 0, 0, -np.inf
-    for k in range(3):
-        a = box[k] * d0 + box[3 + k] * d1 + box[6 + k] * d2
-        if abs(a) - box[12 + k] > most:
-            axis, side, most = k, 1 if a >= 0.0 else 0, abs(a) - box[12 + k]
-    beside = 0.0
-    for k in range(3):
-        if k != axis:
-            a = box[k] * d0 + box[3 + k] * d1 + box[6 + k] * d2
-            beside = max(beside, abs(a) / box[12 + k])
-    return axis, side, beside
-
-
-@njit(cache=True)
-def _stands_for(m, n0, n1, n2, surfaces, on, count):
-    """Which of the smooth surfaces that are touched stands for shape m, touched along
-    n; -1: none."""
-    for k in range(count):
-        if n0 * on[k, 3] + n1 * on[k, 4] + n2 * on[k, 5] > ALIKE:
-            for i in range(6):
-                if surfaces[m, i] == on[k, 0]:
-                    return k
-    return -1
-
-
 @njit(cache=True, inline="always")
 def _push_apart(F, T, s, a, b, a0, a1, a2, b0, b1, b2, depth, n0, n1, n2, law,
                 slip):  # fmt: skip
@@ -611,7 +429,6 @@ def _is_carried(F, T, s, b, o, p0, p1, p2, radius, box, law, slip):
 @njit(cache=True)
 def _rate(t, s, mass, com, inertia, inverse, gravity, spheres, owner, fixed, pairs,
           levers, rims, mutual, boxes, carried, forces, drag, slip, fade, patches,
-          smooth, of_smooth, surfaces, around, middles, at, counts, fits,
           dx):  # fmt: skip
     """State s (n_bodies, 13): quaternion (4), centre of mass (3), w in world (3), its
     velocity (3)."""
@@ -646,9 +463,6 @@ def _rate(t, s, mass, com, inertia, inverse, gravity, spheres, owner, fixed, pai
     moving = _in_world(s, turned, com, boxes)
     c = np.empty((len(spheres), 3))
     axis = np.empty(3)
-    is_smooth = len(of_smooth) > 0
-    is_many = is_smooth or len(fixed) > FEW
-    on = np.empty((MOST_ON if is_smooth else 0, 6))
     b, R = -1, turned[0]
     for j in range(len(spheres)):
         if owner[j] != b:
@@ -662,24 +476,7 @@ def _rate(t, s, mass, com, inertia, inverse, gravity, spheres, owner, fixed, pai
         for i in range(3):
             c[j, i] = s[b, 4 + i] + R[i, 0] * b0 + R[i, 1] * b1 + R[i, 2] * b2
         radius, what = spheres[j, 3], rims[j, 4]
-        p0, p1, p2, count, near = c[j, 0], c[j, 1], c[j, 2], 0, len(fixed)
-        if is_many:
-            near = _look(j, p0, p1, p2, radius, rims[j, 3], fixed, smooth, around,
-                         middles, at)  # fmt: skip
-        if is_smooth and what == 0.0:
-            count = _on_smooth(
-                j, p0, p1, p2, radius, fixed, smooth, of_smooth, surfaces, around,
-                middles, at, counts, fits, on,
-            )  # fmt: skip
-        for k in range(count):
-            if on[k, 2] < 0.0:
-                m = int(on[k, 1])
-                _press(
-                    F, T, s, b, p0, p1, p2, -on[k, 2], on[k, 3], on[k, 4], on[k, 5],
-                    radius, 1.0, j, m, pairs, levers, slip, fade, patches,
-                )  # fmt: skip
-        for each in range(near):
-            m = around[j, 1 + each] if is_many else each
+        for m in range(len(fixed)):
             p0, p1, p2, share_of = c[j, 0], c[j, 1], c[j, 2], 1.0
             if _is_apart(p0, p1, p2, radius + rims[j, 3], fixed[m]):
                 continue
@@ -704,8 +501,6 @@ def _rate(t, s, mass, com, inertia, inverse, gravity, spheres, owner, fixed, pai
                     p2 -= far * (n2 - along * axis[2])
                     gap, n0, n1, n2 = _gap(p0, p1, p2, radius, fixed[m])
             if gap >= 0.0:
-                continue
-            if count and _stands_for(m, n0, n1, n2, surfaces, on, count) >= 0:
                 continue
             _press(F, T, s, b, p0, p1, p2, -gap, n0, n1, n2, radius, share_of,
                    j, m, pairs, levers, slip, fade, patches)  # fmt: skip
@@ -755,7 +550,7 @@ def _rate(t, s, mass, com, inertia, inverse, gravity, spheres, owner, fixed, pai
 @njit(cache=True)
 def _run(start, times, mass, com, inertia, inverse, gravity, spheres, owner, fixed,
          pairs, levers, rims, mutual, boxes, carried, forces, drag, slip, fade, patches,
-         smooth, of_smooth, surfaces, max_step, tol):  # fmt: skip
+         max_step, tol):  # fmt: skip
     n, N = len(times), len(mass)
     out = np.full((n, N, 13), np.nan)
     s = start.copy()
@@ -771,11 +566,9 @@ def _run(start, times, mass, com, inertia, inverse, gravity, spheres, owner, fix
     k1, k2 = np.empty((N, 13)), np.empty((N, 13))
     k3, k4 = np.empty((N, 13)), np.empty((N, 13))
     t, h, steps = times[0], 1e-4, 0
-    around, middles, at, counts, fits = _looks(len(spheres), len(fixed), len(smooth))
     new = np.empty((N, 13))
     _rate(t, s, mass, com, inertia, inverse, gravity, spheres, owner, fixed, pairs,
           levers, rims, mutual, boxes, carried, forces, drag, slip, fade, patches,
-          smooth, of_smooth, surfaces, around, middles, at, counts, fits,
           k1)  # fmt: skip
     for i in range(n):
         while t < times[i] - 1e-12:
@@ -789,15 +582,13 @@ def _run(start, times, mass, com, inertia, inverse, gravity, spheres, owner, fix
                     new[b, j] = s[b, j] + 0.5 * step * k1[b, j]
             _rate(t + 0.5 * step, new, mass, com, inertia, inverse, gravity, spheres,
                   owner, fixed, pairs, levers, rims, mutual, boxes, carried, forces,
-                  drag, slip, fade, patches, smooth, of_smooth, surfaces, around,
-                  middles, at, counts, fits, k2)  # fmt: skip
+                  drag, slip, fade, patches, k2)  # fmt: skip
             for b in range(N):
                 for j in range(13):
                     new[b, j] = s[b, j] + 0.75 * step * k2[b, j]
             _rate(t + 0.75 * step, new, mass, com, inertia, inverse, gravity, spheres,
                   owner, fixed, pairs, levers, rims, mutual, boxes, carried, forces,
-                  drag, slip, fade, patches, smooth, of_smooth, surfaces, around,
-                  middles, at, counts, fits, k3)  # fmt: skip
+                  drag, slip, fade, patches, k3)  # fmt: skip
             for b in range(N):
                 for j in range(13):
                     new[b, j] = s[b, j] + step * (
@@ -806,8 +597,7 @@ def _run(start, times, mass, com, inertia, inverse, gravity, spheres, owner, fix
                     )  # fmt: skip
             _rate(t + step, new, mass, com, inertia, inverse, gravity, spheres, owner,
                   fixed, pairs, levers, rims, mutual, boxes, carried, forces, drag,
-                  slip, fade, patches, smooth, of_smooth, surfaces, around, middles, at,
-                  counts, fits, k4)  # fmt: skip
+                  slip, fade, patches, k4)  # fmt: skip
             worst = 0.0
             for b in range(N):
                 for j in range(13):

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from makebreak.gap.problem import Candidate, Nuisances
-from makebreak.gap.residuals.touch import SHAPES
 from makebreak.gap.simulation.free_windows import FreeBodyModel, touched
 from makebreak.gap.simulation.windows import WindowModel
 from makebreak.models.effects import KINDS
@@ -59,15 +58,9 @@ _DRAGS = {"N s/m": 0.3, "N m s/rad": 3e-4, "N s2/m2": 0.1}
 
 
 def contact_nuisances(model: FreeBodyModel | WindowModel) -> Nuisances:
-    """Contact stiffness and dissipation within the scene's tolerance (relative); how
-    well shapes are known where a ball rolls on a smooth surface [m]."""
+    """Contact stiffness and dissipation within the scene's tolerance (relative)."""
     columns, prior, names = [], [], []
-    known = float(model.scene.tolerance.get("shape_m", SHAPES))
-    balls = _on_smooth(model) if isinstance(model, FreeBodyModel) else []
-    rolls = model if isinstance(model, FreeBodyModel) and balls else None
-    # What is never struck shows a stiffness by its depth alone: hundredths of a
-    # millimetre, which shapes are not known to.
-    for kind in () if rolls and not rolls.is_struck else CONTACT_LAW:
+    for kind in CONTACT_LAW:
         share = float(model.scene.tolerance.get(kind, 0.0))
         if share <= 0.0:
             continue
@@ -83,29 +76,9 @@ def contact_nuisances(model: FreeBodyModel | WindowModel) -> Nuisances:
             columns.append((model.base() - r) / step)
             prior.append(share)
             names.append(f"{kind} of {at}")
-    for name, radius in balls if known > 0.0 else ():
-        r = _residual(model, Effect("object_size", [name], {"radius": radius + known}))
-        if r is not None and np.abs(model.base() - r).max() > 1e-6:
-            columns.append((model.base() - r) / known)
-            prior.append(known)
-            names.append(f"shape of {name}")
-    if rolls and known > 0.0:
-        columns.append((rolls.base() - rolls.moved_out(known)) / known)
-        prior.append(known)
-        names.append("shape of what is rolled on")
     if not columns:
         return Nuisances.none(len(model.train()))
     return Nuisances(np.stack(columns, axis=1), np.array(prior), tuple(names))
-
-
-def _on_smooth(model: FreeBodyModel) -> list[tuple[str, float]]:
-    """Balls, and their radii [m], that touch a smooth surface: they start on it, so
-    that what is off by next to nothing is off at all times."""
-    return [
-        (name, float(body.spheres[0, 3]))
-        for name, body in zip(model.bodies, model.free_bodies.each, strict=True)
-        if len(body.spheres) == 1 and model.surfaces_met(name)
-    ]
 
 
 def contact_candidates(

@@ -189,15 +189,6 @@ class FlightProblem(FreeBodyModel, WindowedProblem):
         except DoesNotFit:
             return None
 
-    def hint(self, end: Fitted) -> str:
-        """How far the faces of what was touched are off a smooth surface."""
-        return "".join(
-            f" {ground} is made of faces that meet at up to {angle:.2g} degrees, up to "
-            f"{1e3 * off:.1g} mm off the smooth surface that was simulated: if they do "
-            "not have its shape, no effect corrects that. Model it with finer faces."
-            for _, ground, angle, off in smooth_surfaces_met(self)
-        )
-
 
 class RolloutProblem(WindowModel, WindowedProblem):
     """Anything else: windows simulated by Drake."""
@@ -232,35 +223,6 @@ def point_on_face_of(model: FreeBodyModel) -> list[Finding]:
             )
         )  # fmt: skip
     return found
-
-
-def smooth_surfaces_met(model: FreeBodyModel) -> list[tuple[str, str, float, float]]:
-    """(body, ground, largest angle between faces [degrees], distance of the surface
-    from them [m]) where a body touches faces that stand for a smooth surface."""
-    found = []
-    for name, body in zip(model.bodies, model.free_bodies.each, strict=True):
-        for ground, surfaces in sorted(model.surfaces_met(name).items()):
-            on = body.smooth.of_surface(surfaces)
-            angle = float(np.degrees(body.smooth.angle[on].max()))
-            found.append((name, ground, angle, float(body.smooth.off[on].max())))
-    return found
-
-
-def smooth_surface_of(model: FreeBodyModel) -> list[Finding]:
-    """A warning where the scene's own simulation knocks at edges of faces."""
-    return [
-        Finding(
-            "smooth_surface", model.recordings[0].name, f"{name} on {ground}",
-            angle, "degrees", "warning",
-            f"The faces of {ground} that {name} touches meet at up to {angle:.2g} "
-            "degrees, and were taken for the smooth surface through their middles, "
-            f"which is up to {1e3 * off:.1g} mm off them. In the scene's own "
-            f"simulation {name} knocks at every edge between them, and is slowed down "
-            "by that: use finer faces, or hydroelastic contact with a mesh, before you "
-            "simulate with the scene.",
-        )
-        for name, ground, angle, off in smooth_surfaces_met(model)
-    ]  # fmt: skip
 
 
 def unexplained_in_windows(

@@ -11,8 +11,6 @@ from pydrake.geometry import (
     Capsule,
     Cylinder,
     HalfSpace,
-    Mesh,
-    ReadObjToTriangleSurfaceMesh,
     Sphere,
 )
 from pydrake.math import RollPitchYaw
@@ -22,13 +20,6 @@ from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.numerics.free_body import EDGE, FACE, FreeBody
-from makebreak.gap.numerics.smooth_faces import (
-    MESH,
-    SmoothFaces,
-    smooth_faces,
-    smooth_mesh,
-    together,
-)
 from makebreak.gap.simulation.face_supports import (
     INNER,
     POINT,
@@ -51,7 +42,6 @@ SPHERE, CORNER, WITHIN, ROUND, ROD = range(5)
 # [m] As far a box may be above what it stands on; it goes on below a half-space.
 STANDS, BELOW = 1e-3, 1.0
 REST_DEPTH = 2e-5  # [m] Of a body on a face that is not stiffer than it need be.
-RIGID = 1e12  # [N/m]
 AT_CORNERS = 0.4  # Of a face's load; it is 0.16 (a disc's rim: 0.33) if pressed evenly.
 # Forces that have their own numbers here; what changes shapes, inertias and surfaces is
 # read off the plant.
@@ -81,45 +71,9 @@ def load_free_bodies(
     bodies = [plant.get_body(i) for i in sorted(plant.GetFloatingBaseBodies())]
     if not bodies or plant.num_velocities() != 6 * len(bodies):
         raise DoesNotFit("expected free bodies and nothing else that moves")
-    if scene.plant.contact_model != "point" and not _rolls_on_mesh(loaded, bodies):
-        raise DoesNotFit(
-            "hydroelastic contact is Drake's alone, but of a ball on a mesh"
-        )
+    if scene.plant.contact_model != "point":
+        raise DoesNotFit("hydroelastic contact is Drake's alone")
     return loaded, bodies
-
-
-def _rolls_on_mesh(loaded: LoadedScene, bodies: Sequence[RigidBody]) -> bool:
-    """Whether one soft ball is all that moves, and what is fixed is rigid meshes."""
-    plant, inspector = loaded.plant, loaded.scene_graph.model_inspector()
-
-    def all_are(body: RigidBody, kind, compliance: str) -> bool:
-        return all(
-            isinstance(inspector.GetShape(g), kind)
-            and _compliance(inspector, g) == compliance
-            for g in plant.GetCollisionGeometriesForBody(body)
-        )
-
-    fixed = [
-        body for k in range(plant.num_bodies())
-        if plant.IsAnchored(body := plant.get_body(BodyIndex(k)))
-        and plant.GetCollisionGeometriesForBody(body)
-    ]  # fmt: skip
-    return (
-        len(bodies) == 1
-        and len(plant.GetCollisionGeometriesForBody(bodies[0])) == 1
-        and all_are(bodies[0], Sphere, "compliant")
-        and bool(fixed)
-        and all(all_are(body, Mesh, "rigid") for body in fixed)
-    )
-
-
-def _compliance(inspector, geometry) -> str:
-    """ "": it is not hydroelastic. (What kind it is Drake does not tell Python.)"""
-    properties = inspector.GetProximityProperties(geometry)
-    if not properties.HasProperty("hydroelastic", "compliance_type"):
-        return ""
-    is_soft = properties.HasProperty("hydroelastic", "hydroelastic_modulus")
-    return "compliant" if is_soft else "rigid"
 
 
 def in_order(effects: Sequence[Effect]) -> list[Effect]:
@@ -239,8 +193,6 @@ class FreeBodyScene:
 
     def body_of(self, now: "Numbers", at_corners: float = AT_CORNERS) -> FreeBody:
         pairs = _pairs(now, self._drake) * self._touch[:, :, None]
-        if self._soft:  # No stiffness of point contacts changes it.
-            pairs[:, :, 0] = self._soft * self._touch
         pairs[..., [0, 5]] *= shares(now, at_corners)[:, None, None]
         pairs[now.role != SPHERE, :, 0] *= self._eased
         return FreeBody(
@@ -248,15 +200,7 @@ class FreeBodyScene:
             now.fixed, pairs,
             now.rolling[None, :] * now.spheres[:, 3:], now.forces, now.drag,
             fade=FADE_RATE, patches=now.patches, rims=now.rims,
-            smooth=self.smooth,
         )  # fmt: skip
-
-    def _softness(self, inspector, geometry) -> float:
-        """[N/m] of a hydroelastic ball: on something flat and rigid it gives pi E d^2
-        at a depth d, which is taken for the spring that is as deep under its weight."""
-        properties = inspector.GetProximityProperties(geometry)
-        modulus = properties.GetProperty("hydroelastic", "hydroelastic_modulus")
-        return float(np.sqrt(np.pi * modulus * self._weight))
 
     def _read(self, loaded: LoadedScene, body: RigidBody) -> None:
         plant, inspector = loaded.plant, loaded.scene_graph.model_inspector()
@@ -302,7 +246,6 @@ class FreeBodyScene:
         context = plant.CreateDefaultContext()
         fixed: list[list[float]] = []
         others, origins = [], []
-        meshes: list[SmoothFaces] = []
         self._grounds: list[str] = []
         self._whole_name = {self.name.split(".")[0]: self.name}
         for i in range(plant.num_bodies()):
@@ -317,9 +260,6 @@ class FreeBodyScene:
                     half = shape.size() / 2.0
                 elif isinstance(shape, HalfSpace):
                     half = np.array([-1.0, 0.0, 0.0])
-                elif isinstance(shape, Mesh) and _compliance(inspector, g):
-                    half = np.array([MESH, 0.0, 0.0])
-                    meshes.append(smooth_mesh(*_surface_of(shape), len(fixed)))
                 else:
                     raise DoesNotFit(f"a {type(shape).__name__} that is fixed")
                 fixed.append([*X.rotation().matrix().ravel(), *X.translation(), *half])
@@ -328,29 +268,21 @@ class FreeBodyScene:
                 name = full_name(plant, ground)
                 self._grounds.append(name)
                 self._whole_name[name.split(".")[0]] = name
-        solid = gone_on(np.array(fixed).reshape(-1, 15))
-        plates = smooth_faces(solid, self._grounds)
-        self.smooth = together([plates, *meshes], len(solid))
         M = body.default_spatial_inertia()
         mass, com = M.get_mass(), np.array(M.get_com())
         about = M.CalcRotationalInertia().CopyToFullMatrix3()
         central = about - mass * (com @ com * np.eye(3) - np.outer(com, com))
         self._gravity = np.array(plant.gravity_field().gravity_vector())
-        self._weight = mass * float(np.linalg.norm(self._gravity))
         self._drake = drakes(plant)
         own = np.array([_surface(inspector, g) for g in mine])
         other = np.array([_surface(inspector, g) for g in others]).reshape(-1, 4)
-        # Of a soft ball on a rigid mesh: its depth is that of the weight.
-        self._soft = self._softness(inspector, mine[0]) if meshes else 0.0
-        if self._soft:
-            own[:, 0], other[:, 0] = self._soft, RIGID
         self._touch = np.array(
             [[not inspector.CollisionFiltered(a, b) for b in others] for a in mine],
             float,
         ).reshape(len(mine), len(others))[of]
         self._numbers = Numbers(
             np.array(mass), com, central, np.array(spheres),
-            solid,
+            gone_on(np.array(fixed).reshape(-1, 15)),
             np.array(origins).reshape(-1, 3),
             own[of], other,
             np.zeros(len(others)), np.zeros((0, 6)), np.zeros(3), np.zeros((0, 6)),
@@ -442,9 +374,7 @@ def _on_the_way_out(fixed, i, axis, side):
                     )  # fmt: skip
                     a += shape[3 * x + k] * (at - shape[9 + x])
                     d += shape[3 * x + k] * way
-                if shape[12] == MESH:
-                    inside = False
-                elif shape[12] < 0.0:
+                if shape[12] < 0.0:
                     if k == 2 and (a > 0.0 or d >= -1e-9):
                         inside = False
                 elif abs(a) > shape[12 + k] + 1e-9:
@@ -456,21 +386,6 @@ def _on_the_way_out(fixed, i, axis, side):
         if inside:
             most = max(most, BELOW if shape[12] < 0.0 else STANDS + left)
     return most
-
-
-def _surface_of(shape: Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) and triangles (T, 3) of a mesh.
-
-    Raises: DoesNotFit of a file that is no OBJ.
-    """
-    if not shape.source().is_path() or shape.extension() != ".obj":
-        raise DoesNotFit("a fixed mesh that is no .obj file")
-    mesh = ReadObjToTriangleSurfaceMesh(str(shape.source().path()))
-    vertices = np.array([mesh.vertex(i) for i in range(mesh.num_vertices())])
-    faces = [mesh.element(i) for i in range(mesh.num_triangles())]
-    triangles = np.array([[f.vertex(k) for k in range(3)] for f in faces])
-    scale = np.ravel(shape.scale3())
-    return vertices * scale, triangles[:, :: int(np.sign(scale.prod()))]
 
 
 def _surface(inspector, geometry) -> list[float]:

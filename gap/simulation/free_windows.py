@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from makebreak.gap.budget import go_on
 from makebreak.gap.data.recording import Episode, Recording
@@ -29,7 +28,6 @@ from makebreak.gap.numerics.free_body import (
 )
 from makebreak.gap.numerics.free_flight import fit_flight, turned_by
 from makebreak.gap.numerics.runs import runs_of
-from makebreak.gap.numerics.smooth_faces import MESH
 from makebreak.gap.numerics.struck import struck_rows
 from makebreak.gap.simulation.free_bodies import FreeBodiesScene
 from makebreak.gap.simulation.free_body import FreeBodyScene
@@ -61,8 +59,6 @@ FLIES = 1.5  # Times the noise that a fit of free flight may leave, to be one.
 UNEVEN = 0.5  # Of the error of all windows: what is held out must have as much of it.
 NEAR = 2e-3  # [m] So near it is taken to touch.
 FAR = 0.01  # [m] So far from it, it never meets it.
-# Of gravity, that carries a ball at least; how far off the scene may have its ground.
-CARRIED, OFF_AT_MOST = 0.3, 0.02  # [-], [m]
 DENSE = 4  # Parts of a row's period at which a signal before a filter is simulated.
 _PLACE = ("x", "y", "z")
 _STATE = (*TURN, *_PLACE, "wx", "wy", "wz", "vx", "vy", "vz")
@@ -128,7 +124,6 @@ class FreeBodyModel(WindowedResidual):
                 raise DoesNotFit(f"expected the orientation of {name}")
             if name in self.with_faces:
                 _check_edges(body, name, recordings)
-            _check_meshes(body, name, recordings)
             self._turns.append(turns)
         self._settle_pairs()
         self.channels, sizes = list[str](), []
@@ -252,38 +247,6 @@ class FreeBodyModel(WindowedResidual):
             for key, off in met_faces(body, grounds, paths).items():
                 if key not in found or abs(off) < abs(found[key]):
                     found[key] = off
-        return found
-
-    @property
-    def free_bodies(self) -> FreeBodies:
-        """As the scene has them."""
-        return self._bodies
-
-    def surfaces_met(self, name: str) -> dict[str, set[int]]:
-        """{fixed body: its smooth surfaces that a body touches, as measured}."""
-        body, found = self.body(name), dict[str, set[int]]()
-        if not len(body.smooth.of):
-            return found
-        for w in self.windows:
-            pose = _window_poses(self, name, w)
-            for row in pose[:: max(len(pose) // 20, 1)]:
-                gap, normal, m = nearest(body, row)
-                if not gap < NEAR:
-                    continue
-                if body.fixed[m, 12] == MESH:
-                    mine = np.flatnonzero(body.smooth.of == m)
-                    x, _ = body.smooth.placed(body.fixed)
-                    far = np.linalg.norm(x[mine] - row[4:7], axis=1)
-                    number = int(body.smooth.surface[mine[np.argmin(far)]])
-                else:
-                    along = normal @ body.fixed[m, :9].reshape(3, 3)
-                    axis = int(np.argmax(np.abs(along)))
-                    face = 2 * axis + int(along[axis] > 0.0)
-                    number = int(body.smooth.surfaces[m, face])
-                if number >= 0:
-                    found.setdefault(self._numbers.each[0].grounds[m], set()).add(
-                        number
-                    )
         return found
 
     def rubs_others(self, friction: Effect) -> bool:
@@ -600,7 +563,6 @@ class FreeBodyModel(WindowedResidual):
             dq = own[:4, 1] - q * (q @ own[:4, 1])
             place, velocity = own[4:, 0] / length, own[4:, 1] / length
             spin = spin_of(q, dq)
-            place, velocity = settled(body, place, velocity, own[4:, 2])
             rolls = w.rolling[k]
             if rolls is not None:
                 if unseen and unseen[k]:
@@ -634,21 +596,9 @@ class FreeBodyModel(WindowedResidual):
                 for k, name in enumerate(self.bodies):
                     if {"world", name, name.split(".")[0]} & set(e.at):
                         lengths[k] *= e.parameters["scale"]
-        return self._simulate_each(bodies, lengths)
-
-    def _simulate_each(self, bodies: FreeBodies, lengths) -> list[np.ndarray]:
         self.runs += 1
         each = [self._simulate(bodies, w, w.state, lengths) for w in self.windows]
         return [np.where(np.isnan(y), np.inf, y) for y in each]
-
-    def moved_out(self, by: float) -> np.ndarray:
-        """residual() of the scene with its smooth surfaces moved along their normals
-        [m]."""
-        each = tuple(replace(body, smooth=body.smooth.moved_out(by))
-                     for body in self._bodies.each)  # fmt: skip
-        bodies = replace(self._bodies, each=each)
-        e = self.errors(self._simulate_each(bodies, np.ones(len(self.bodies))))
-        return np.concatenate([x.ravel() for x in e])[self.measured()]
 
     def errors(self, simulated: Sequence[np.ndarray]) -> list[np.ndarray]:
         """(measured - simulated)/std of each window, no more than the cap; 0 where
@@ -703,28 +653,6 @@ def rides(
     return rows > 0 and near > MOSTLY * rows
 
 
-def settled(body: FreeBody, place, velocity, acceleration):
-    """Place and velocity (3,) from which a ball starts that is on a smooth surface: as
-    deep in it as its load presses it, and along it.
-
-    Where a camera shows it, tenths of a millimetre off, a stiff contact would fling it
-    up, and what it does next in a bowl depends on that. That it is carried by something
-    is told by its acceleration (3,), which is not gravity's.
-    """
-    carried = acceleration - body.gravity
-    if len(body.spheres) > 1 or body.com.any() or not len(body.smooth.of):
-        return place, velocity
-    if np.linalg.norm(carried) < CARRIED * np.linalg.norm(body.gravity):
-        return place, velocity
-    gap, normal, m = nearest(body, np.array([1.0, 0.0, 0.0, 0.0, *place]))
-    is_smooth = body.fixed[m, 12] == MESH or (body.smooth.surfaces[m] >= 0).any()
-    if not is_smooth or abs(gap) > OFF_AT_MOST:
-        return place, velocity
-    load = max(float(body.mass) * float(carried @ normal), 0.0)
-    depth = load / max(float(body.pairs[0, m, 0]), 1e-9)
-    return place - (gap + depth) * normal, velocity - (velocity @ normal) * normal
-
-
 def lies_on_side(body: FreeBodyScene, recordings: Sequence[Recording]) -> bool:
     """Whether a body's cylinders lie on their sides in all that was measured.
 
@@ -763,22 +691,6 @@ def _check_edges(body: FreeBody, name: str, recordings: Sequence[Recording]) -> 
             sides = np.sort(beyond[near], axis=1)[:, :2]
             if (sides > -size).any():
                 raise DoesNotFit(f"{name} is near an edge of what it touches")
-
-
-def _check_meshes(body: FreeBody, name: str, recordings: Sequence[Recording]) -> None:
-    """Raises: DoesNotFit where a ball comes to an edge of a mesh, of which only smooth
-    surfaces are touched."""
-    if not (body.fixed[:, 12] == MESH).any():
-        return
-    x, normal = body.smooth.placed(body.fixed)
-    radius = float(body.spheres[0, 3])
-    tree = cKDTree(x + radius * normal)  # Where its centre is when it touches there.
-    for recording in recordings:
-        pose = _poses(name, recording)
-        pose = pose[:: len(pose) // 500 + 1]
-        far, k = tree.query(pose[:, 4:])
-        if (body.smooth.is_edge[k] & (far < body.smooth.spacing[k])).any():
-            raise DoesNotFit(f"{name} comes to an edge of a mesh")
 
 
 def _size(body: FreeBody) -> float:

@@ -3,21 +3,18 @@ r"""The same in the large: scenes that nobody had in mind when the method was wr
     python tests/gap_benchmark/large_scenes.py SCENE HIDE SEED FOLDER [--camera HZ] \
         [--no-wrench]
 
-writes a scene and its recording into FOLDER and prints what is hidden. Worlds are
-MuJoCo, and for the bowl an ODE: no contact law is the one of the scene.
+writes a scene and its recording into FOLDER and prints what is hidden. The world is
+MuJoCo: its contact law is not the one of the scene.
 """
 
 import argparse
 import json
-import re
 import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import numba
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 if __name__ == "__main__":  # The package is found beside the tests.
     sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
@@ -32,18 +29,14 @@ from gap_benchmark.contact_cases import (
     tip_robot,
 )
 from gap_benchmark.contact_scenes import (
-    MODULUS,
     Episode,
     Sensing,
     Setting,
     Shape,
     Thing,
-    _measured,
-    _noise,
     pair,
     pair_friction,
     record,
-    to_sdf,
     write_scene,
 )
 from gap_benchmark.robots import Body, Robot
@@ -302,196 +295,6 @@ def hidden(s: Setting, name: str, rng) -> tuple[Setting, list[dict]]:
     return hide(s, [name], rng)
 
 
-# ----- A ball in a bowl, by an ODE
-
-
-@numba.njit(cache=True)
-def _rolls(s, t0, times, middle, g, R, r, m, k, d, mu, rolling, out):
-    """State: centre p (3), v (3), w (3) in world, q (4). middle (3,): of the bowl, a
-    sphere of radius R; g (3,): gravity. Semi-implicit steps of 10 us."""
-    h, t, inertia = 1e-5, t0, 0.4 * m * r * r
-    for i in range(len(times)):
-        while t < times[i] - 0.5 * h:
-            c = s[:3] - middle
-            far = np.sqrt(c @ c)
-            n = -c / far
-            f, torque = m * g, np.zeros(3)
-            depth = far + r - R
-            if depth > 0.0:
-                v, w = s[3:6], s[6:9]
-                arm = -r * n
-                u = v + np.cross(w, arm)
-                un = u @ n
-                fn = max(k * depth - d * un, 0.0)
-                ut = u - un * n
-                ft = -mu * fn / np.sqrt(ut @ ut + 1e-7) * ut
-                wt = w - (w @ n) * n
-                f += fn * n + ft
-                torque += np.cross(arm, ft)
-                torque -= rolling * r * fn / np.sqrt(wt @ wt + 1e-4) * wt
-            s[3:6] += h / m * f
-            s[6:9] += h / inertia * torque
-            s[:3] += h * s[3:6]
-            w = s[6:9]
-            q = s[9:13].copy()
-            s[9] += 0.5 * h * (-w[0] * q[1] - w[1] * q[2] - w[2] * q[3])
-            s[10] += 0.5 * h * (w[0] * q[0] + w[1] * q[3] - w[2] * q[2])
-            s[11] += 0.5 * h * (w[1] * q[0] + w[2] * q[1] - w[0] * q[3])
-            s[12] += 0.5 * h * (w[2] * q[0] + w[0] * q[2] - w[1] * q[1])
-            s[9:13] /= np.sqrt(s[9:13] @ s[9:13])
-            t += h
-        out[i, :3], out[i, 3:] = s[:3], s[9:13]
-
-
-def bowl_of_plates(R: float, mu: float, degrees: float) -> Thing:
-    """What simulators take for a bowl: plates that touch a sphere from outside."""
-    step, plates = np.radians(degrees), []
-    for k in range(int(np.radians(70.0) / step) + 1):
-        theta = k * step
-        n = max(round(2 * np.pi * np.sin(theta) / step), 1)
-        for j in range(n):
-            phi = 2 * np.pi * j / n
-            out = np.array([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi),
-                            -np.cos(theta)])  # fmt: skip
-            half = (0.6 * step * R, 0.6 * step * R, 0.005)
-            at = (R + half[2]) * out + [0.0, 0.0, R]
-            turn = (0.0, -theta, phi)  # z of the plate to the middle.
-            plates.append(Shape("box", half, mu, tuple(map(float, at)), turn))
-    return Thing("bowl", tuple(plates))
-
-
-def bowl_mesh(R: float, degrees: float) -> str:
-    """The same as a shell, 5 mm thick, as text of a Wavefront file."""
-    rings = round(70.0 / degrees)
-    around = 2 * round(180.0 / degrees)
-    lines, faces = [], []
-    for r in (R, R + 0.005):
-        lines.append(f"v 0 0 {R - r!r}")
-        for theta in np.radians(70.0) * np.arange(1, rings + 1) / rings:
-            for phi in 2 * np.pi * np.arange(around) / around:
-                x, y = np.cos(phi), np.sin(phi)
-                s, c = r * np.sin(theta), R - r * np.cos(theta)
-                lines.append(f"v {float(s * x)!r} {float(s * y)!r} {float(c)!r}")
-
-    def at(side: int, ring: int, k: int) -> int:
-        first = 1 + side * (1 + rings * around)
-        return first + (ring > 0) * (1 + (ring - 1) * around + k % around)
-
-    for k in range(around):
-        for ring in range(rings):
-            for side in (0, 1):
-                a, b = at(side, ring, k), at(side, ring, k + 1)
-                c, d = at(side, ring + 1, k), at(side, ring + 1, k + 1)
-                each = [(a, c, d), (a, d, b)] if ring else [(a, c, d)]
-                faces += [f[:: -1 if side else 1] for f in each]
-        a, b = at(0, rings, k), at(0, rings, k + 1)
-        c, d = at(1, rings, k), at(1, rings, k + 1)
-        faces += [(a, c, d), (a, d, b)]
-    return "\n".join([*lines, *(f"f {a} {b} {c}" for a, b, c in faces)]) + "\n"
-
-
-def with_mesh(folder: Path, s: Setting, mesh: str) -> None:
-    """Writes the bowl of a scene's folder as a rigid mesh, and the ball as soft."""
-    bowl, one = s.thing("bowl"), s.free[0]
-    text = to_sdf(replace(bowl, shapes=bowl.shapes[:1]), s, compliant=True)
-    shape = r"<pose>[^<]*</pose><geometry>.*</geometry>"
-    text = re.sub(shape, "<geometry><mesh><uri>bowl.obj</uri></mesh></geometry>", text)
-    (folder / "bowl.obj").write_text(mesh)
-    (folder / "bowl.sdf").write_text(text)
-    # As deep under its weight as in its world.
-    modulus = s.stiffness**2 / (np.pi * one.mass * G)
-    soft = to_sdf(one, s, compliant=True).replace(f">{MODULUS}<", f">{modulus!r}<")
-    (folder / f"{one.name}.sdf").write_text(soft)
-    scene = folder / "scene.yaml"
-    point, soft = "contact_model: point", "contact_model: hydroelastic"
-    scene.write_text(scene.read_text().replace(point, soft))
-
-
-def write_bowl(
-    name: str, rng, folder: Path, hz: float, degrees: float = 8.0, is_mesh: bool = False
-):
-    """A ball that rolls to and fro. name: what is hidden, or ""; degrees: between the
-    plates, or the triangles, that model the bowl."""
-    R = r_bowl = float(rng.uniform(0.15, 0.25))
-    one = round_ball(rng)
-    r, mu = float(rng.uniform(0.015, 0.025)), float(rng.uniform(0.3, 0.5))
-    m = float(rng.uniform(0.03, 0.1))
-    one = replace(one, shapes=(Shape("sphere", (r,), mu),), mass=m,
-                  inertia=(0.4 * m * r * r,) * 3)  # fmt: skip
-    s = Setting((bowl_of_plates(R, mu, degrees), one), stiffness=2e4)
-    mu_true, r_true, rolling, effects = mu, r, 0.0, []
-    moved, g, slips = np.zeros(3), np.array([0.0, 0.0, -G]), 0.0
-    at = f"{one.body}~bowl.bowl"
-    up = rng.choice([-1.0, 1.0])
-    if name == "rolling":
-        rolling = float(rng.uniform(0.004, 0.01))
-        effects = [{"kind": "rolling_resistance", "at": at,
-                    "parameters": {"coefficient": rolling}}]  # fmt: skip
-    elif name == "size":
-        r_true = r * (1.0 + float(up * rng.uniform(0.08, 0.15)))
-        effects = [{"kind": "object_size", "at": one.body,
-                    "parameters": {"radius": r_true}}]  # fmt: skip
-    elif name == "bowl_radius":
-        r_bowl = R * (1.0 + float(up * rng.uniform(0.08, 0.15)))
-        effects = [{"kind": "(outside the catalogue)", "at": "bowl.bowl",
-                    "parameters": {"radius": r_bowl}}]  # fmt: skip
-    elif name == "friction":  # It shows while the ball slides.
-        slips = 1.0
-        mu_true = mu * float(rng.uniform(0.5, 0.7) if up < 0 else rng.uniform(1.4, 1.8))
-        effects = [{"kind": "contact_friction", "at": at,
-                    "parameters": {"friction": mu_true}}]  # fmt: skip
-    elif name == "place":
-        moved[:2] = rng.uniform(0.004, 0.01, 2) * rng.choice([-1.0, 1.0], 2)
-        x, y, _ = moved.tolist()
-        effects = [{"kind": "wall_position", "at": "bowl.bowl",
-                    "parameters": {"x": x, "y": y}}]  # fmt: skip
-    elif name == "tilt":
-        roll, pitch = rng.uniform(0.01, 0.03, 2) * rng.choice([-1.0, 1.0], 2)
-        # The scene turned so, seen in its own axes.
-        turn = Rotation.from_euler("xyz", [roll, pitch, 0.0])
-        g = turn.inv().apply(g)
-        effects = [{"kind": "gravity_tilt", "at": "world",
-                    "parameters": {"roll": roll, "pitch": pitch}}]  # fmt: skip
-    elif name:
-        raise ValueError(f"no law for {name}")
-    sense = Sensing(camera_hz=hz, wrench=None)
-    s = replace(s, rate=float(hz))
-    tables = []
-    for number in range(6):
-        t = np.arange(int(2.5 * hz)) / hz
-        theta, phi = rng.uniform(0.5, 0.8), rng.uniform(-np.pi, np.pi)
-        way = np.array([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi),
-                        -np.cos(theta)])  # fmt: skip
-        middle = moved + [0.0, 0.0, R]
-        p = (r_bowl - r_true) * way + middle
-        aside = rng.uniform(-0.3, 0.3)
-        v = aside * np.array([-np.sin(phi), np.cos(phi), 0.0])
-        w = np.cross(-way, v) / r_true
-        if slips:
-            w += (
-                slips
-                * rng.uniform(0.5, 1.0)
-                * np.cross(way, rng.normal(size=3))
-                / r_true
-            )
-        start = np.concatenate([p, v, w, [1.0, 0.0, 0.0, 0.0]])
-        rows = np.empty((len(t), 7))
-        _rolls(start, 0.0, t, middle, g, r_bowl, r_true, m, s.stiffness, 2.0, mu_true,
-               rolling, rows)  # fmt: skip
-        kept: dict[str, list] = {k: [] for k in ("q", "v", "c", "u", "f")}
-        tables.append(_measured(s, t, number, kept, {one.body: rows}, sense, rng))
-    columns = {k: np.concatenate([e[k] for e in tables]) for k in tables[0]}
-    tolerance = {"contact_stiffness": 0.1, "contact_dissipation": 1.0}
-    write_scene(folder, s, columns, _noise(s, columns, sense), 0.0005, tolerance)
-    if is_mesh:
-        with_mesh(folder, s, bowl_mesh(R, degrees))
-    return effects
-
-
-# Degrees between plates; whether it is a mesh.
-BOWLS = {"bowl": (8.0, False), "bowl_fine": (2.5, False), "bowl_mesh": (4.0, True)}
-
-
 # ----- Cases
 
 
@@ -501,8 +304,6 @@ def write(
     """Writes scene and recording, of so many episodes at most. Returns: what is hidden,
     which is not in the folder."""
     rng = np.random.default_rng(seed)
-    if scene in BOWLS:
-        return write_bowl(name, rng, folder, hz, *BOWLS[scene])
     s, episodes = SCENES[scene](rng)
     truth, effects = hidden(s, name, rng) if name else (s, [])
     sense = Sensing(hz, wrench=0.05 if wrench else None)
@@ -514,7 +315,7 @@ def write(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Writes a scene and its recording.")
-    parser.add_argument("scene", choices=[*SCENES, *BOWLS])
+    parser.add_argument("scene", choices=[*SCENES])
     parser.add_argument("hide", help="what is hidden, or none")
     parser.add_argument("seed", type=int)
     parser.add_argument("folder", type=Path)
