@@ -75,26 +75,13 @@ class FreeBodies:
     mutual (n, n, 6): of two spheres of different bodies, all bodies' spheres in a row,
     the first one before the second: as FreeBody.pairs has them, with the share of the
     contact point that lies on the first one's surface; 0 where they do not touch.
-    boxes (k, 16): boxes of bodies, as FreeBody.fixed has them, in the body's frame, and
-    its number. carried (n, k, 6): of each sphere and a box of another body, as
-    FreeBody.pairs; 0 where they do not touch.
     """
 
     each: tuple[FreeBody, ...]
     mutual: np.ndarray
-    boxes: np.ndarray = field(default_factory=lambda: np.zeros((0, 16)))
-    carried: np.ndarray | None = None
 
     def __post_init__(self):
         n = sum(len(body.spheres) for body in self.each)
-        if self.carried is None:
-            object.__setattr__(self, "carried", np.zeros((n, len(self.boxes), 6)))
-        assert self.carried is not None
-        if self.carried.shape != (n, len(self.boxes), 6):
-            raise ValueError(
-                f"FreeBodies.carried is {self.carried.shape}, expected "
-                f"{(n, len(self.boxes), 6)}"
-            )
         if self.mutual.shape != (n, n, 6):
             raise ValueError(
                 f"FreeBodies.mutual is {self.mutual.shape}, expected {(n, n, 6)}"
@@ -143,7 +130,6 @@ def simulate_all(
         np.concatenate([body.pairs for body in each]),
         np.concatenate([body.levers for body in each]),
         np.concatenate([_rims(body) for body in each]), bodies.mutual,
-        bodies.boxes, bodies.carried,
         owned([body.forces for body in each], 6),
         np.array([body.drag for body in each]), each[0].slip, each[0].fade,
         owned([body.patches for body in each], 6), max_step, tol,
@@ -157,11 +143,6 @@ def _rims(body: FreeBody) -> np.ndarray:
 def placed(pose, points) -> np.ndarray:
     """(n, 3) points of the body's frame (n, 3) in world; pose (7,) as in `start`."""
     return np.asarray(pose[4:7]) + points @ _matrix(np.asarray(pose[:4], float)).T
-
-
-def placed_in(pose, points) -> np.ndarray:
-    """(n, 3) points of the world (n, 3) in the body's frame: placed() turned round."""
-    return (points - np.asarray(pose[4:7])) @ _matrix(np.asarray(pose[:4], float))
 
 
 def lowest_gap(body: FreeBody, pose) -> float:
@@ -392,43 +373,8 @@ def _meet(F, T, s, c, spheres, owner, i, j, law, slip):
 
 
 @njit(cache=True)
-def _in_world(s, turned, com, boxes):
-    """(k, 15) boxes of bodies as fixed shapes are given, where they are now."""
-    found = np.empty((len(boxes), 15))
-    for k in range(len(boxes)):
-        o = int(boxes[k, 15])
-        R = turned[o]
-        for i in range(3):
-            found[k, 9 + i] = s[o, 4 + i]
-            found[k, 12 + i] = boxes[k, 12 + i]
-            for j in range(3):
-                found[k, 9 + i] += R[i, j] * (boxes[k, 9 + j] - com[o, j])
-                found[k, 3 * i + j] = (
-                    R[i, 0] * boxes[k, j]
-                    + R[i, 1] * boxes[k, 3 + j]
-                    + R[i, 2] * boxes[k, 6 + j]
-                )
-    return found
-
-
-@njit(cache=True)
-def _is_carried(F, T, s, b, o, p0, p1, p2, radius, box, law, slip):
-    """Contact of a sphere of body b, at p, with a box of body o."""
-    if _is_apart(p0, p1, p2, radius, box):
-        return
-    gap, n0, n1, n2 = _gap(p0, p1, p2, radius, box)
-    if gap >= 0.0:
-        return
-    reach = radius + (1.0 - law[4]) * gap
-    p0, p1, p2 = p0 - reach * n0, p1 - reach * n1, p2 - reach * n2
-    a0, a1, a2 = p0 - s[b, 4], p1 - s[b, 5], p2 - s[b, 6]
-    b0, b1, b2 = p0 - s[o, 4], p1 - s[o, 5], p2 - s[o, 6]
-    _push_apart(F, T, s, b, o, a0, a1, a2, b0, b1, b2, -gap, n0, n1, n2, law, slip)
-
-
-@njit(cache=True)
 def _rate(t, s, mass, com, inertia, inverse, gravity, spheres, owner, fixed, pairs,
-          levers, rims, mutual, boxes, carried, forces, drag, slip, fade, patches,
+          levers, rims, mutual, forces, drag, slip, fade, patches,
           dx):  # fmt: skip
     """State s (n_bodies, 13): quaternion (4), centre of mass (3), w in world (3), its
     velocity (3)."""
@@ -460,7 +406,6 @@ def _rate(t, s, mass, com, inertia, inverse, gravity, spheres, owner, fixed, pai
         for i in range(3):
             T[b, i] = -drag[b, 1] * s[b, 7 + i]
         _push(F, T, b, o[b, 0], o[b, 1], o[b, 2], f[b, 0], f[b, 1], f[b, 2])
-    moving = _in_world(s, turned, com, boxes)
     c = np.empty((len(spheres), 3))
     axis = np.empty(3)
     b, R = -1, turned[0]
@@ -504,10 +449,6 @@ def _rate(t, s, mass, com, inertia, inverse, gravity, spheres, owner, fixed, pai
                 continue
             _press(F, T, s, b, p0, p1, p2, -gap, n0, n1, n2, radius, share_of,
                    j, m, pairs, levers, slip, fade, patches)  # fmt: skip
-        for k in range(len(boxes)):
-            if carried[j, k, 0] > 0.0:
-                _is_carried(F, T, s, b, int(boxes[k, 15]), c[j, 0], c[j, 1], c[j, 2],
-                            radius, moving[k], carried[j, k], slip)  # fmt: skip
         for i in range(j):
             if owner[i] == b:  # So are all that follow.
                 break
@@ -549,7 +490,7 @@ def _rate(t, s, mass, com, inertia, inverse, gravity, spheres, owner, fixed, pai
 
 @njit(cache=True)
 def _run(start, times, mass, com, inertia, inverse, gravity, spheres, owner, fixed,
-         pairs, levers, rims, mutual, boxes, carried, forces, drag, slip, fade, patches,
+         pairs, levers, rims, mutual, forces, drag, slip, fade, patches,
          max_step, tol):  # fmt: skip
     n, N = len(times), len(mass)
     out = np.full((n, N, 13), np.nan)
@@ -568,7 +509,7 @@ def _run(start, times, mass, com, inertia, inverse, gravity, spheres, owner, fix
     t, h, steps = times[0], 1e-4, 0
     new = np.empty((N, 13))
     _rate(t, s, mass, com, inertia, inverse, gravity, spheres, owner, fixed, pairs,
-          levers, rims, mutual, boxes, carried, forces, drag, slip, fade, patches,
+          levers, rims, mutual, forces, drag, slip, fade, patches,
           k1)  # fmt: skip
     for i in range(n):
         while t < times[i] - 1e-12:
@@ -581,13 +522,13 @@ def _run(start, times, mass, com, inertia, inverse, gravity, spheres, owner, fix
                 for j in range(13):
                     new[b, j] = s[b, j] + 0.5 * step * k1[b, j]
             _rate(t + 0.5 * step, new, mass, com, inertia, inverse, gravity, spheres,
-                  owner, fixed, pairs, levers, rims, mutual, boxes, carried, forces,
+                  owner, fixed, pairs, levers, rims, mutual, forces,
                   drag, slip, fade, patches, k2)  # fmt: skip
             for b in range(N):
                 for j in range(13):
                     new[b, j] = s[b, j] + 0.75 * step * k2[b, j]
             _rate(t + 0.75 * step, new, mass, com, inertia, inverse, gravity, spheres,
-                  owner, fixed, pairs, levers, rims, mutual, boxes, carried, forces,
+                  owner, fixed, pairs, levers, rims, mutual, forces,
                   drag, slip, fade, patches, k3)  # fmt: skip
             for b in range(N):
                 for j in range(13):
@@ -596,7 +537,7 @@ def _run(start, times, mass, com, inertia, inverse, gravity, spheres, owner, fix
                         + 4.0 / 9.0 * k3[b, j]
                     )  # fmt: skip
             _rate(t + step, new, mass, com, inertia, inverse, gravity, spheres, owner,
-                  fixed, pairs, levers, rims, mutual, boxes, carried, forces, drag,
+                  fixed, pairs, levers, rims, mutual, forces, drag,
                   slip, fade, patches, k4)  # fmt: skip
             worst = 0.0
             for b in range(N):

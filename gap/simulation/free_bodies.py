@@ -19,7 +19,6 @@ from makebreak.gap.simulation.free_body import (
     drakes,
     in_order,
     load_free_bodies,
-    shares,
 )
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.contact import DAMPER
@@ -30,8 +29,8 @@ from makebreak.models.scene import LoadedScene, Scene
 class FreeBodiesScene:
     """A scene's free bodies; effects change their numbers without another plant.
 
-    Bodies touch one another with spheres that are their own shapes. Those that stand in
-    for faces touch the box of another body that carries them (`carries`), no other.
+    Bodies touch one another with spheres that are their own shapes, not with those that
+    stand in for faces.
 
     Args: on_side: names of bodies whose cylinders lie on their sides. loaded: the
         scene, if it is loaded already.
@@ -46,8 +45,6 @@ class FreeBodiesScene:
     ):
         self.scene, self._on_side = scene, tuple(on_side)
         self._eased: tuple[np.ndarray, ...] = ()
-        # {(body, number of the one whose box carries it): how much less stiff}.
-        self._carried: dict[tuple[int, int], float] = {}
         loaded, bodies = load_free_bodies(scene, loaded)
         plant, inspector = loaded.plant, loaded.scene_graph.model_inspector()
         self.each = [
@@ -76,44 +73,6 @@ class FreeBodiesScene:
                 a, b = sorted(self.names.index(name) for name in pair)
                 self._damper[a, b] = effect.parameters["damping"]
 
-    def carries(self, rider: str, carrier: str) -> None:
-        """Lets a body touch the one box of another with the spheres of its faces."""
-        i, j = self.names.index(rider), self.names.index(carrier)
-        self._carried[i, j] = 1.0
-
-    def rides(self, one: str, other: str) -> bool:
-        """Whether `carries` was said of them."""
-        pairs = {(self.names[i], self.names[j]) for i, j in self._carried}
-        return (one, other) in pairs
-
-    def ease_carried(self) -> None:
-        """FreeBodyScene.ease of what is carried and never hits what carries it."""
-        for i, j in self._carried:
-            numbers = [one.numbers() for one in self.each]
-            law = self._law(i, j, numbers, AT_CORNERS, self._damper)
-            self._carried[i, j] = self.each[i].eased(law[:, 0].sum())
-
-    def _law(self, i: int, j: int, numbers, at_corners: float, damper) -> np.ndarray:
-        """(n, 6) of the spheres of body i and the box of body j that carries it."""
-        now = numbers[i]
-        a, b = min(i, j), max(i, j)
-        law = combined(now.own, numbers[j].own[0], damper[a, b], self._drake)
-        law[:, [0, 5]] *= shares(now, at_corners)[:, None]
-        law[:, 0] *= self._carried[i, j]
-        return law
-
-    def _on_boxes(self, numbers, at_corners: float, damper):
-        """FreeBodies.boxes and carried."""
-        count = [len(one.spheres) for one in numbers]
-        first = np.concatenate([[0], np.cumsum(count)])
-        boxes = np.zeros((len(self._carried), 16))
-        carried = np.zeros((sum(count), len(boxes), 6))
-        for k, (i, j) in enumerate(self._carried):
-            boxes[k] = [*numbers[j].boxes[0], j]
-            law = self._law(i, j, numbers, at_corners, damper)
-            carried[first[i] : first[i + 1], k] = law
-        return boxes, carried
-
     def meet(self, a: str, b: str) -> bool:
         """Whether two of them would touch, and with shapes that have no spheres."""
         i, j = sorted((self.names.index(a), self.names.index(b)))
@@ -139,7 +98,6 @@ class FreeBodiesScene:
             other = FreeBodiesScene(more, self._on_side)
             if self._eased:
                 other.ease(self._eased)
-            other._carried = dict(self._carried)
             return other.bodies((), at_corners)
         numbers = [one.numbers() for one in self.each]
         damper = np.array(self._damper)
@@ -152,13 +110,9 @@ class FreeBodiesScene:
         owner = np.repeat(np.arange(len(each)), [len(one.spheres) for one in each])
         own = np.concatenate([now.own for now in numbers])
         touch = self._touch[owner[:, None], owner[None, :]]
-        boxes, carried = self._on_boxes(numbers, at_corners, damper)
         damper = damper[owner[:, None], owner[None, :]]
         mutual = combined(own[:, None], own[None, :], damper, self._drake)
-        for i, j in self._carried:
-            touch[np.ix_(owner == i, owner == j)] = False
-            touch[np.ix_(owner == j, owner == i)] = False
-        return FreeBodies(each, mutual * touch[..., None], boxes, carried)
+        return FreeBodies(each, mutual * touch[..., None])
 
     def _change(self, effect: Effect, numbers: list[Numbers], damper) -> None:
         """Applies an effect as models/effects does to the plant: that on a pair may

@@ -124,19 +124,6 @@ class FreeBodyScene:
         return list(self._grounds)
 
     @property
-    def is_box(self) -> bool:
-        """Whether one box is all that it touches with."""
-        roles = self._numbers.role
-        return len(self._numbers.boxes) == 1 and bool(
-            np.isin(roles, (CORNER, WITHIN)).all()
-        )
-
-    @property
-    def box(self) -> np.ndarray:
-        """(15,) its box, as fixed shapes are given, in its frame."""
-        return self._numbers.boxes[0]
-
-    @property
     def has_faces(self) -> bool:
         """Whether spheres stand in for its shapes."""
         return bool((self._numbers.role != SPHERE).any())
@@ -148,14 +135,11 @@ class FreeBodyScene:
         Args: on (m,): on which of the fixed shapes; none: on all.
         """
         faces = np.isin(self._numbers.role, (CORNER, WITHIN))
-        eased = self.eased(self.body().pairs[faces, :, 0].sum(axis=0))
-        self._eased = eased if on is None else np.where(on, eased, 1.0)
-
-    def eased(self, stiffness):
-        """How much less stiff all of its faces together, or each of them (m,), need be
-        to carry it."""
+        stiffness = self.body().pairs[faces, :, 0].sum(axis=0)
         weight = float(self._numbers.mass) * float(np.linalg.norm(self._gravity))
-        return np.minimum(1.0, weight / REST_DEPTH / np.maximum(0.5 * stiffness, 1e-9))
+        carries = np.maximum(0.5 * stiffness, 1e-9)
+        eased = np.minimum(1.0, weight / REST_DEPTH / carries)
+        self._eased = eased if on is None else np.where(on, eased, 1.0)
 
     def body(
         self, effects: Sequence[Effect] = (), at_corners: float = AT_CORNERS
@@ -209,12 +193,9 @@ class FreeBodyScene:
             raise DoesNotFit(f"{self.name} has nothing to touch with")
         self.axes: list[np.ndarray] = []  # Of its cylinders, in the body's frame.
         spheres, rims, role, of = [], [], list[int](), list[int]()
-        inner, boxes = 0.0, []
+        inner = 0.0
         for i, g in enumerate(mine):
             shape, X = inspector.GetShape(g), inspector.GetPoseInFrame(g)
-            if isinstance(shape, Box):
-                half = shape.size() / 2.0
-                boxes.append([*X.rotation().matrix().ravel(), *X.translation(), *half])
             if isinstance(shape, Sphere):
                 each = [(SPHERE, [0.0, 0.0, 0.0, shape.radius()])]
             elif isinstance(shape, Capsule):
@@ -287,7 +268,7 @@ class FreeBodyScene:
             own[of], other,
             np.zeros(len(others)), np.zeros((0, 6)), np.zeros(3), np.zeros((0, 6)),
             np.full(len(others), np.nan), np.array(role), np.array(inner),
-            np.array(rims), np.array(boxes).reshape(-1, 15),
+            np.array(rims),
         )  # fmt: skip
         for effect in loaded.effects:
             if effect.kind in FORCES:
@@ -303,8 +284,7 @@ class Numbers:
     """What effects change. own (n, 4), other (m, 4): stiffness (inf: Drake's guess),
     dissipation, static and dynamic friction of each surface; rolling (m,); damper (m,):
     in the place of the dissipation, NaN where there is none; role (n,) of each sphere;
-    inner: corners of a face for each sphere within it; rims (n, 5) as of FreeBody;
-    boxes (k, 15): of the body, as fixed shapes are given, in its frame."""
+    inner: corners of a face for each sphere within it; rims (n, 5) as of FreeBody."""
 
     mass: np.ndarray
     com: np.ndarray
@@ -322,7 +302,6 @@ class Numbers:
     role: np.ndarray
     inner: np.ndarray
     rims: np.ndarray
-    boxes: np.ndarray
 
 
 def shares(now: Numbers, at_corners: float) -> np.ndarray:
@@ -449,7 +428,6 @@ def _size(now: Numbers, p, on) -> None:
     scale = p["scale"] if "scale" in p else p["radius"] / now.spheres[0, 3]
     now.spheres *= scale
     now.rims[:, 3] *= scale
-    now.boxes[:, 9:] *= scale
     now.com *= scale
     now.inertia *= scale**2
 

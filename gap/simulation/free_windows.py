@@ -23,7 +23,6 @@ from makebreak.gap.numerics.free_body import (
     lowest_gap,
     nearest,
     placed,
-    placed_in,
     simulate_all,
 )
 from makebreak.gap.numerics.free_flight import fit_flight, turned_by
@@ -125,7 +124,7 @@ class FreeBodyModel(WindowedResidual):
             if name in self.with_faces:
                 _check_edges(body, name, recordings)
             self._turns.append(turns)
-        self._settle_pairs()
+        self._check_pairs()
         self.channels, sizes = list[str](), []
         for name, body in zip(self.bodies, self._bodies.each, strict=True):
             own = [f"{name}.{a}" for a in _STATE]
@@ -158,8 +157,6 @@ class FreeBodyModel(WindowedResidual):
                 [self._lies_on(body, name) | (not self.is_struck)
                  for body, name in each]
             )  # fmt: skip
-            if not self.is_struck:
-                self._numbers.ease_carried()
             self._bodies = self._numbers.bodies()
         if _is_beyond_chance(self._curvatures):
             # Drag, say: a start fitted by gravity alone would be wrong, and the effect
@@ -198,32 +195,7 @@ class FreeBodyModel(WindowedResidual):
 
     def places_of(self, kind: str) -> list[str]:
         """Where a kind may act."""
-        places = map(self._by_rider, self.dynamics.places(kind))
-        return [at for at in places if at not in self.never_met]
-
-    def _by_rider(self, at: str) -> str:
-        """A pair of bodies with the one first that lies on the other: an effect on the
-        pair changes the surface of the first one, which the other's friction with what
-        itself lies on does not depend on."""
-        first, _, second = at.partition("~")
-        return f"{second}~{first}" if self._numbers.rides(second, first) else at
-
-    @cached_property
-    def never_met(self) -> set[str]:
-        """Pairs of a body that another one carries, and of what is fixed, which it
-        never comes near: their friction would stand for that of what carries it."""
-        found = set()
-        for name, body, one in zip(
-            self.bodies, self._bodies.each, self._numbers.each, strict=True
-        ):
-            if not any(self._numbers.rides(name, other) for other in self.bodies):
-                continue
-            least = np.min(self._gaps_seen(body, name), axis=0, initial=np.inf)
-            grounds = np.array(one.grounds)
-            for ground in set(one.grounds):
-                if least[grounds == ground].min() > FAR:
-                    found.add(f"{name}~{ground}")
-        return found
+        return self.dynamics.places(kind)
 
     def _lies_on(self, body: FreeBody, name: str) -> np.ndarray:
         """(m,) on which of the fixed shapes a body lies nearly all the time, so that it
@@ -262,12 +234,9 @@ class FreeBodyModel(WindowedResidual):
             if ground.any()
         )
 
-    def _settle_pairs(self) -> None:
-        """Lets bodies lie on one another.
-
-        Raises: DoesNotFit where two bodies come near each other that would touch with
-            spheres which stand in for faces, and none of them lies on the other's face.
-        """
+    def _check_pairs(self) -> None:
+        """Raises: DoesNotFit where two bodies come near each other, one of which would
+        touch the other with spheres that stand in for faces."""
         for (i, a), (j, b) in itertools.combinations(enumerate(self.bodies), 2):
             if not {a, b} & {*self.with_faces} or not self._numbers.meet(a, b):
                 continue
@@ -279,16 +248,8 @@ class FreeBodyModel(WindowedResidual):
                 )
                 apart = np.linalg.norm(one - other, axis=1)
                 least = min(least, np.nanmin(apart, initial=9e9))
-            if least >= reach:
-                continue
-            each = self._numbers.each
-            if rides(each[i], each[j], self.recordings):
-                self._numbers.carries(a, b)
-            elif rides(each[j], each[i], self.recordings):
-                self._numbers.carries(b, a)
-            else:
+            if least < reach:
                 raise DoesNotFit(f"{a} and {b} come near each other")
-        self._bodies = self._numbers.bodies()
 
     # ----- Cutting
 
@@ -622,35 +583,6 @@ class FreeBodyModel(WindowedResidual):
             e = e / np.sqrt(1.0 + (e / self._cap) ** 2)
             out.append(np.where(np.isfinite(seen), e / std, 0.0))
         return out
-
-
-def rides(
-    one: FreeBodyScene, other: FreeBodyScene, recordings: Sequence[Recording]
-) -> bool:
-    """Whether a box lies on a face of another one, which reaches beyond it, in most of
-    what was measured, and else does not touch it."""
-    if not (one.is_box and other.is_box):
-        return False
-    signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
-    corners = one.box[9:12] + (signs * one.box[12:]) @ one.box[:9].reshape(3, 3).T
-    R, middle, half = other.box[:9].reshape(3, 3), other.box[9:12], other.box[12:]
-    near, rows = 0, 0
-    for recording in recordings:
-        there = [f"{n}.{c}" for n in (one.name, other.name) for c in (*TURN, *_PLACE)]
-        pose = np.stack([recording[c] for c in there], axis=1)
-        for x in pose[np.isfinite(pose).all(axis=1)]:
-            rows += 1
-            p = (placed_in(x[7:], placed(x[:7], corners)) - middle) @ R
-            beyond = np.abs(p) - half
-            axis = int(np.argmax(beyond.min(axis=0)))  # Of the face that it is over.
-            touches = beyond[:, axis] < NEAR
-            across = [k for k in range(3) if k != axis]
-            if not touches.any():
-                continue
-            if (beyond[np.ix_(touches, across)] > 0.0).any():
-                return False
-            near += int(touches.sum() >= 3)
-    return rows > 0 and near > MOSTLY * rows
 
 
 def lies_on_side(body: FreeBodyScene, recordings: Sequence[Recording]) -> bool:
