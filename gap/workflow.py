@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-from makebreak.gap.at_impacts import impacts_differ
 from makebreak.gap.budget import (
     CONCLUDE,
     LESS_SURE,
@@ -355,19 +354,6 @@ def _compared(
             return problem, selection, result
         return other, then, named
 
-    def between_impacts(problem: FlightProblem) -> GapResult:
-        between = problem.between_impacts() if unnamed else None
-        if between is None:
-            return result
-        say("searching between impacts")
-        apart = conclude(between, select(between, say), reported, checks, jobs)
-        named_there = [each.effect() for each in apart.effects]
-        start = selection.start
-        whole = problem.outcome(
-            named_there, start, start, selection.nuisances, reported or None, jobs
-        )
-        return impacts_differ(problem, apart, whole) or result
-
     def alone(name: str) -> Alone:
         say(f"searching {name} separately")
         mine, its = ([r for r in some if r.name == name]
@@ -381,14 +367,6 @@ def _compared(
             return result
         return with_differences(result, Together(problem, selection), alone)
 
-    unnamed = result.verdict == "gap_unnamed" and not (
-        result.effects and result.gap.reduction >= CLOSED_SHARE_MIN
-    )
-    if isinstance(problem, FlightProblem):
-        result = budget.if_time(
-            "searching between impacts", partial(between_impacts, problem), result
-        )
-        seconds["impacts"] = clock.lap()
     again: ProblemOf = partial(problem_for, meets=meets)
     touching = isinstance(problem, ContactProblem)
     if result.verdict == "gap_unnamed" and touching:

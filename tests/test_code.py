@@ -61,7 +61,7 @@ GAP_ROOMS = {
     "report": {"shared", "data", "simulation", "report"},
 }
 GAP_TOGETHER = (
-    "__init__", "workflow", "by_recording", "at_impacts", "verdict", "confirm",
+    "__init__", "workflow", "by_recording", "verdict", "confirm",
 )  # fmt: skip
 
 

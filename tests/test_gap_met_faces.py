@@ -10,7 +10,6 @@ from makebreak.gap.data.conditioning import condition
 from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.numerics.free_body import FreeBody
 from makebreak.gap.residuals.contact import _patches
-from makebreak.gap.residuals.objects import FlightProblem
 from makebreak.gap.simulation.free_windows import FreeBodyModel
 from makebreak.gap.simulation.met_faces import met_faces
 from makebreak.gap.workflow import run_gap
@@ -55,10 +54,9 @@ def write_scene(folder: Path) -> Path:
     return scene
 
 
-def write_log(folder: Path, off: float, kick: float = 0.0) -> Path:
+def write_log(folder: Path, off: float) -> Path:
     """Eight balls slide into the wall, which stands `off` farther. It pushes each back
-    for half a period of the ball on its spring, and gives back all of its speed; and
-    kicks every other one aside, to the left or to the right [m/s]."""
+    for half a period of the ball on its spring, and gives back all of its speed."""
     rng, t = np.random.default_rng(0), np.arange(0.0, 1.2, 1.0 / 120.0)
     omega, rows = np.sqrt(STIFFNESS / MASS), []
     for episode in range(8):
@@ -73,7 +71,6 @@ def write_log(folder: Path, off: float, kick: float = 0.0) -> Path:
             ),
         )  # fmt: skip
         y = 0.1 * rng.normal() + 0.1 * rng.normal() * t
-        y = y + kick * (-1.0) ** episode * np.maximum(since - 0.5 * np.pi / omega, 0.0)
         z = np.full(len(t), RADIUS - MASS * G / STIFFNESS)
         place = np.column_stack([x, y, z]) + NOISE * rng.normal(size=(len(t), 3))
         rows.append(np.column_stack([t, np.full(len(t), episode), place]))
@@ -108,28 +105,6 @@ def test_a_wall_that_is_run_against_is_not_searched_for_patches_of_friction(tmp_
 def test_a_wall_where_the_scene_has_it_is_no_gap(tmp_path):
     result = run_gap(write_scene(tmp_path), [write_log(tmp_path, 0.0)])
     assert (result.verdict, result.effects) == ("no_gap", [])
-
-
-@pytest.mark.slow
-def test_what_impacts_do_otherwise_is_said_and_what_lies_between_is_judged(tmp_path):
-    """No law of the catalogue kicks a ball to the left and the next one to the right:
-    nothing is named for it, and the sentence says where it is."""
-    scene, log = write_scene(tmp_path), write_log(tmp_path, 0.0, 0.2)
-    recordings, _ = condition(read_recordings([log]), False)
-    problem = FlightProblem(read_scene(scene), recordings)
-    between = problem.between_impacts()
-    assert between is not None and between.between_impacts() is None
-    for w in between.windows:  # The wall's face is where the balls' middles turn.
-        rows = recordings[w.recording]["ball.ball.x"][w.rows]
-        assert rows.max() < WALL - RADIUS
-    assert any(w.hit < len(w.std) for w in problem.windows)
-    again = between._again(recordings)
-    assert again.after_sec == 0.0
-    result = run_gap(scene, [log])
-    assert (result.verdict, result.effects) == ("gap_unnamed", [])
-    assert result.says.startswith("Between impacts: The scene and the recordings agree")
-    assert "most in ball.ball.y" in result.says and result.gap.after > 2.0
-    assert result.where
 
 
 @pytest.mark.slow

@@ -173,21 +173,7 @@ class FlightProblem(FreeBodyModel, WindowedProblem):
         return self
 
     def _again(self, recordings: Sequence[Recording]) -> FreeBodyModel:
-        return FreeBodyModel(
-            self.scene, recordings, self.after_sec, dynamics=self.dynamics
-        )
-
-    def between_impacts(self) -> "FlightProblem | None":
-        """The problem of windows that end before an impact; None where there is none,
-        or nothing is left."""
-        if self.after_sec == 0.0 or not any(w.hit < len(w.std) for w in self.windows):
-            return None
-        try:
-            return FlightProblem(
-                self.scene, self.recordings, 0.0, dynamics=self.dynamics
-            )
-        except DoesNotFit:
-            return None
+        return FreeBodyModel(self.scene, recordings, dynamics=self.dynamics)
 
 
 class RolloutProblem(WindowModel, WindowedProblem):

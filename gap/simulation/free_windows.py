@@ -87,8 +87,7 @@ class FreeWindow:
 class FreeBodyModel(WindowedResidual):
     """Residuals of windows of free bodies, as InverseModel gives those of mechanisms.
 
-    Args: after_sec: that a window goes on after its impact; 0: it ends before it.
-        dynamics: of the scene, which takes long to load if it has many shapes.
+    Args: dynamics: of the scene, which takes long to load if it has many shapes.
     Raises: DoesNotFit where scene or recordings hold anything else (FreeBodiesScene),
         or bodies with faces come near one another; the bodies' x, y and z must be
         measured.
@@ -98,7 +97,6 @@ class FreeBodyModel(WindowedResidual):
         self,
         scene: Scene,
         recordings: Sequence[Recording],
-        after_sec: float = AFTER_SEC,
         most: int = 48,
         dynamics: SceneDynamics | None = None,
     ):
@@ -145,7 +143,6 @@ class FreeBodyModel(WindowedResidual):
             {c: stages for c in self.channels if (stages := r.channels[c].stages)}
             for r in recordings
         ]
-        self.after_sec = after_sec
         # Of each flight, and how much a curvature of its path that gravity does not
         # make takes off its squared residuals.
         self._curvatures: list[float] = []
@@ -347,8 +344,8 @@ class FreeBodyModel(WindowedResidual):
         spans = []
         if before_hit:
             first = b + int(np.argmax(rough[b:]))
-            end = int(np.searchsorted(time, time[first] + self.after_sec, "right"))
-            end = min(end, len(time)) if self.after_sec > 0.0 else b
+            end = int(np.searchsorted(time, time[first] + AFTER_SEC, "right"))
+            end = min(end, len(time))
             spans.append((a, b, time[first], end, first))
         if time[b - 1] - time[a] >= LEAST_SEC:
             starts = np.arange(time[a], time[b - 1] - LEAST_SEC, LONG_SEC)
