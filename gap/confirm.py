@@ -88,7 +88,7 @@ def confirmed(problem: GapProblem, selection: Selection, judge: Judge) -> Confir
         vetoed += found
         selection = without(problem, selection, *[choice.effect for choice, _ in found])
         outcome = judge(selection)
-    if outcome is not None and any(c.ties or c.sets for c in selection.choices):
+    if outcome is not None and any(c.ties for c in selection.choices):
         selection = _without_refuted(problem, selection, judge)
     return Confirmed(selection, outcome, tuple(vetoed))
 
@@ -351,16 +351,12 @@ def _without_refuted(
     if ours is None or not ours.gap.window_s or not ours.gap.is_measured:
         return selection
 
-    def is_refuted(instead: Sequence[Effect], of: Sequence[Effect]) -> bool:
-        gone = {(e.kind, tuple(e.at)) for e in of}
-        rest = [
-            c for c in selection.choices
-            if (c.effect.kind, tuple(c.effect.at)) not in gone
-        ]  # fmt: skip
-        effects = [*(c.effect for c in rest), *instead]
+    def is_refuted(tie: Effect, of: Choice) -> bool:
+        rest = [c for c in selection.choices if c is not of]
+        effects = [*(c.effect for c in rest), tie]
         end = selection.end
         if rest:
-            fixed = [*fixed_parameters(rest), *(() for _ in instead)]
+            fixed = [*fixed_parameters(rest), ()]
             try:
                 end = fit_effects(problem, selection.screen(problem), effects, fixed)
             except (ValueError, RuntimeError):
@@ -376,16 +372,9 @@ def _without_refuted(
         return gap_left and ours.gap.after < SIMULATED_RIVAL_GAIN * left
 
     choices = [
-        replace(
-            c,
-            ties=tuple(t for t in c.ties if not is_refuted([t], [c.effect])),
-            sets=tuple(
-                s for s in c.sets
-                if not is_refuted(s.instead, [c.effect, *s.beside])
-            ),
-        )
+        replace(c, ties=tuple(t for t in c.ties if not is_refuted(t, c)))
         for c in selection.choices
-    ]  # fmt: skip
+    ]
     return replace(selection, choices=tuple(choices))
 
 

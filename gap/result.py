@@ -76,21 +76,11 @@ class Evidence:
 
 
 @dataclass(frozen=True)
-class RivalSet:
-    """Effects that explain the data as well in the place of an effect and of those that
-    are named beside it: `instead` of it and of `beside`."""
-
-    beside: tuple[Effect, ...]
-    instead: tuple[Effect, ...]
-
-
-@dataclass(frozen=True)
 class NamedEffect:
     """An effect that the model lacks.
 
     indistinguishable_from: others that explain these data as well, with the parameters
-    that they would have. sets: the same of this effect and another one together.
-    identifiable: "identifiable", "weak" or "not". recordings: in
+    that they would have. identifiable: "identifiable", "weak" or "not". recordings: in
     which it is, where it is not in all of them.
     """
 
@@ -103,7 +93,6 @@ class NamedEffect:
     tell_apart: str = ""
     identifiable: str = "identifiable"
     recordings: tuple[str, ...] = ()
-    sets: tuple[RivalSet, ...] = ()
 
     def effect(self) -> Effect:
         """As a scene file lists it."""
@@ -421,13 +410,6 @@ def _effect_json(each: NamedEffect) -> dict[str, Any]:
         },
         "identifiable": each.identifiable,
         "indistinguishable_from": [_of(e) for e in each.indistinguishable_from],
-        "indistinguishable_together": [
-            {
-                "with": [{k: _of(e)[k] for k in ("kind", "at")} for e in s.beside],
-                "from": [_of(e) for e in s.instead],
-            }
-            for s in each.sets
-        ],
         "tell_apart": each.tell_apart,
     }
 

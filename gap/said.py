@@ -28,7 +28,7 @@ def said_together(
     for k, each in enumerate(effects):
         key: object = k
         if KINDS[each.kind].at in ("joint", "actuator", "drive") and not (
-            each.indistinguishable_from or each.sets
+            each.indistinguishable_from
         ):
             values = [(p.unit, p.value < 0.0) for p in each.parameters.values()]
             key = (each.kind, *values) if len(values) == 1 else k

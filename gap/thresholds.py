@@ -82,13 +82,6 @@ BRANCHES_MAX = 4
 # Rivals that are tried in the place of one of two effects that were added at once.
 PAIR_RIVALS_MAX = 3
 
-# Ties of two effects together: looked for if so many effects are named or fewer (but
-# for groups), among pairs of so many candidates, of which so many are fitted exactly.
-SETS_OF_MOST, SET_CANDIDATES, SETS_TRIED = 4, 20, 2
-# What such a pair may leave open, by columns, of what the two named ones close: columns
-# of large effects are that wrong.
-SET_OPEN_SHARE = 0.25
-
 # ----- Two effects at once
 
 # Candidates all pairs of which are tried against the best single effect.

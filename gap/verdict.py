@@ -155,7 +155,7 @@ WITH_EFFECTS: Sequence[Row] = (
     (lambda f: leaves_gap(f.start, min(f.end, f.below))
      and not _closed_in_simulation(f), "gap_unnamed", _said("")),
     (lambda f: bool(f.turned), "ambiguous", lambda f: f.turned),
-    (lambda f: any(c.ties or c.sets for c in f.choices), "ambiguous", _said("")),
+    (lambda f: any(c.ties for c in f.choices), "ambiguous", _said("")),
     (lambda f: True, "gap_named", _said("")),
 )  # fmt: skip
 
@@ -309,8 +309,7 @@ def named(choice: Choice, plant: MultibodyPlant, beside: str = "") -> NamedEffec
         if spread > 0.0:
             std[each.name] = spread
     apart = ""
-    tied = bool(choice.ties or choice.sets)
-    if tied or kind.tell_apart:
+    if choice.ties or kind.tell_apart:
         apart = kind.tell_apart[:1].upper() + kind.tell_apart[1:] + "."
     says = sentence(choice.effect, kind, std, slides, choice.or_more, choice.fixed)
     says = says.replace(OF_CHANNEL, own_unit)
@@ -325,9 +324,8 @@ def named(choice: Choice, plant: MultibodyPlant, beside: str = "") -> NamedEffec
             choice.before, choice.after, choice.runner_up, choice.margin, choice.why
         ),
         choice.ties,
-        apart if tied else "",
+        apart if choice.ties else "",
         "weak" if weak else "identifiable",
-        sets=choice.sets,
     )
 
 
@@ -400,11 +398,4 @@ def _apart_from(effects: Sequence[NamedEffect]) -> str:
         if places:
             it = "It" if it == "it" else f"The {it}"
             text += f" {it} could equally be at {' or '.join(places)}."
-    for each in effects:
-        for rival in each.sets:
-            two = [f"{each.kind} at {', '.join(each.at)}", *map(called, rival.beside)]
-            text += (
-                f" These data cannot distinguish {' together with '.join(two)} from "
-                f"{' together with '.join(map(called, rival.instead))}."
-            )
     return text

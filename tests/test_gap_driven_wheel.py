@@ -219,22 +219,3 @@ def test_a_gain_is_as_well_as_the_masses_are_known(tmp_path):
     assert std["gain"] == pytest.approx(
         np.hypot(0.03 * value, fit.std[0]["gain"]), rel=1e-6
     )
-
-
-@pytest.mark.slow
-def test_two_frictions_for_which_a_gain_and_a_mass_could_stand_are_a_tie(tmp_path):
-    """Of a slide whose effort alone is known: 0.45 for 0.25 on both plates, or a drive
-    that gives 0.25/0.45 of its force and a sled that is as much lighter."""
-    selection = select(problem_of(dragged_tool(tmp_path, 0.45)))
-    named = [c.effect for c in selection.choices]
-    sets = [s.instead for c in selection.choices for s in c.sets]
-    frictions = [
-        {e.at[0]: e.parameters["friction"] for e in each}
-        for each in (named, *sets)
-        if {e.kind for e in each} == {"contact_friction"}
-    ]
-    assert len(selection.choices) == 2 and sets
-    assert frictions == [{
-        "left.left~rig.tool": pytest.approx(0.45, rel=0.01),
-        "right.right~rig.tool": pytest.approx(0.45, rel=0.01),
-    }]  # fmt: skip

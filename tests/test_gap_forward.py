@@ -1,13 +1,11 @@
 """Forward selection: back to a tie, and one effect in the place of two."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from test_gap_statistics import TwoChannels
 
 from makebreak.gap.problem import Candidate, SearchPlan
-from makebreak.gap.search import forward, merge
+from makebreak.gap.search import forward
 from makebreak.gap.search.all_at_once import all_at_once
 from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.search.select import select
@@ -126,61 +124,6 @@ def test_progress_is_said_after_the_last_effect_was_added_too():
     select(problem, said.append)
     for words in ("  without joint_coulomb_friction at arm.joint6", ", as a tie: "):
         assert any(words in text for text in said), words
-
-
-class LateLoad(Columns):
-    """A load is no candidate before the link's mass and its centre of mass are there
-    (as where links that may be off by their tolerance imitate what it does more)."""
-
-    def candidates(self, nuisances, current):
-        found = super().candidates(nuisances, current)
-        kinds = {e.kind for e in current.effects}
-        late = kinds >= {MASS, "link_com"}
-        return [c for c in found if late or c.kind != "payload"]
-
-
-def loads(hidden, unexplained=0.0):
-    """Of what a load's inertia does, a mass and a centre of mass do nothing."""
-    of = directions(5)
-    mass, com = of[:, :1], 10.0 * of[:, 1:4]
-    columns = {
-        (MASS, "arm.link7"): mass,
-        ("link_com", "arm.link7"): com,
-        ("payload", "arm.link7"): np.hstack([mass + 0.2 * of[:, 4:], com]),
-    }
-    problem = LateLoad(columns, hidden)
-    problem._base += unexplained * np.random.default_rng(2).normal(size=600)
-    return named(problem)
-
-
-def test_two_effects_at_one_place_give_way_to_one_that_explains_more():
-    values = [3.0, 0.2, 0.09, 0.09]
-    found = loads({("payload", "arm.link7"): values})
-    assert set(found) == {("payload", "arm.link7")}
-    load = found["payload", "arm.link7"]
-    np.testing.assert_allclose(list(load.effect.parameters.values()), values, atol=0.03)
-    # Both together left 0.2 x 30 and the noise.
-    assert load.runner_up == "link_mass and link_com at arm.link7"
-    assert load.margin == pytest.approx(np.hypot(6.0, 1.0) - 1.0, rel=0.15)
-
-
-def test_a_mass_and_a_centre_of_mass_that_explain_as_much_stay():
-    hidden = {(MASS, "arm.link7"): 3.0, ("link_com", "arm.link7"): [0.2, 0.09, 0.09]}
-    assert set(loads(hidden)) == set(hidden)
-    assert set(loads(hidden, unexplained=3.0)) == set(hidden)
-
-
-@pytest.mark.parametrize(
-    "error, missing, better",
-    [(0.9, True, True), (1.0, True, False), (1.0, False, True), (1.1, False, False)],
-)
-def test_one_effect_that_leaves_as_much_is_better_if_nothing_is_missing_then(
-    error, missing, better
-):
-    """(Two took what they could not do from links that may be off by a tolerance.)"""
-    search = SimpleNamespace(error=lambda score: score, needs_more=lambda fit: missing)
-    one, two = SimpleNamespace(score=error), SimpleNamespace(score=1.0)
-    assert merge._does_better(search, one, two) == better
 
 
 JOINT = ["arm.joint6"]

@@ -33,7 +33,6 @@ from makebreak.gap.result import (
     GapMeasure,
     GapResult,
     NamedEffect,
-    RivalSet,
     Series,
     Trust,
     Unexplained,
@@ -398,25 +397,6 @@ def test_a_tie_is_said_with_what_tells_it_apart(case, tmp_path):
     assert "    to distinguish them: move the joint at two speeds" in summary_lines(
         result
     )
-
-
-def test_a_tie_of_two_effects_together_is_said(case, tmp_path):
-    rotor = Effect("rotor_inertia", ["p.j1"], {"inertia": 0.2})
-    effect = replace(case[2].effects[0], sets=(RivalSet((VISCOUS,), (rotor,)),))
-    result = replace(case[2], verdict="ambiguous", effects=[effect])
-    words = "together with joint_viscous_damping at p.j1: " + sentence(
-        rotor, KINDS[rotor.kind]
-    )
-    text = text_of(written(case, tmp_path, result))
-    assert "These data cannot distinguish it from: Together with" in text
-    assert f"    or: {words}" in summary_lines(result)
-    found = json.loads((tmp_path / "result.json").read_text())["effects"][0]
-    assert found["indistinguishable_together"] == [{
-        "with": [{"kind": "joint_viscous_damping", "at": "p.j1"}],
-        "from": [
-            {"kind": "rotor_inertia", "at": "p.j1", "parameters": {"inertia": 0.2}}
-        ],
-    }]  # fmt: skip
 
 
 def test_a_runner_up_that_is_ahead_is_said_to_be(case, tmp_path):

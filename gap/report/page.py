@@ -15,7 +15,6 @@ from makebreak.gap.report.summary import (
     next_best,
     number,
     says_of,
-    sets_of,
     windows_of,
 )
 from makebreak.gap.result import GapResult, NamedEffect, Unexplained
@@ -132,11 +131,11 @@ def _effect(each: NamedEffect, result: GapResult, i: int) -> str:
 
 
 def _ties(each: NamedEffect) -> str:
-    if not each.indistinguishable_from and not each.sets:
+    if not each.indistinguishable_from:
         return ""
     others = "".join(
         f"<li>{sentence_html(other)}</li>"
-        for other in [*map(says_of, each.indistinguishable_from), *sets_of(each)]
+        for other in map(says_of, each.indistinguishable_from)
     )
     tell = f"<p><b>To distinguish them:</b> {sentence_html(each.tell_apart)}</p>"
     return (

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from makebreak.gap.data.findings import Finding
-from makebreak.gap.result import Evidence, GapResult, NamedEffect
+from makebreak.gap.result import Evidence, GapResult
 from makebreak.gap.said import said_together
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, sentence
@@ -41,7 +41,6 @@ def summary_lines(result: GapResult) -> list[str]:
     for each in result.effects:
         for other in each.indistinguishable_from:
             lines.append(f"    or: {says_of(other)}")
-        lines += [f"    or: {says}" for says in sets_of(each)]
         if each.tell_apart:
             lines.append(f"    to distinguish them: {each.tell_apart}")
     for none in result.tried:
@@ -90,16 +89,6 @@ def windows_of(result: GapResult) -> str:
     """What the gap was measured over; a length of 0: nothing had to be simulated."""
     seconds = result.gap.window_s
     return f"simulated windows of {number(seconds)} s" if seconds > 0.0 else "samples"
-
-
-def sets_of(each: NamedEffect) -> list[str]:
-    """What may stand for an effect and another one together."""
-    found = []
-    for rival in each.sets:
-        beside = " and ".join(f"{e.kind} at {', '.join(e.at)}" for e in rival.beside)
-        instead = "; ".join(map(says_of, rival.instead))
-        found.append(f"together with {beside}: {instead}")
-    return found
 
 
 def says_of(effect: Effect) -> str:

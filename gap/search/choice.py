@@ -8,7 +8,7 @@ import numpy as np
 
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Candidate, Fitted, GapProblem, Nuisances
-from makebreak.gap.result import Considered, RivalSet
+from makebreak.gap.result import Considered
 from makebreak.gap.search.screen import Ranked
 from makebreak.gap.thresholds import (
     MEMBER_Z,
@@ -66,7 +66,6 @@ class Choice:
     paired: bool = False
     or_more: tuple[str, ...] = ()
     needed_beside: tuple[tuple[str, tuple[str, ...]], ...] = ()
-    sets: tuple[RivalSet, ...] = ()
     why: str = ""
 
 
@@ -87,18 +86,6 @@ class Selection:
     table: tuple[Considered, ...] = ()
     beyond: tuple[tuple[str, float], ...] = ()
     far: bool = False
-
-    def __post_init__(self):
-        # Ties of two effects go with either of them.
-        there = places(self.choices)
-        whole = [
-            replace(c, sets=tuple(
-                s for s in c.sets
-                if all((e.kind, tuple(e.at)) in there for e in s.beside)
-            )) if c.sets else c
-            for c in self.choices
-        ]  # fmt: skip
-        object.__setattr__(self, "choices", tuple(whole))
 
     def screen(self, problem: GapProblem) -> Screen:
         """With which the end was fitted."""

@@ -8,12 +8,10 @@ from dataclasses import replace
 
 from makebreak.gap.fit import fit_effects
 from makebreak.gap.problem import GapProblem, Outcome, is_sane
-from makebreak.gap.result import RivalSet
 from makebreak.gap.said import called
 from makebreak.gap.search.choice import (
     Choice,
     Selection,
-    refreshed,
     units_of,
 )
 from makebreak.gap.search.select import without
@@ -99,8 +97,6 @@ def preferred_by_simulation(
     as good are simulated too, and one that leaves clearly less is taken."""
     if not problem.plan.simulation_agrees:
         return selection, outcome
-    if outcome is not None:
-        selection, outcome = _sets_by_simulation(problem, selection, outcome, jobs)
     if len(selection.choices) != 1:
         return selection, outcome
     if outcome is None or outcome.gap.after <= AGREEMENT_RMS_MAX or not selection.table:
@@ -139,54 +135,3 @@ def preferred_by_simulation(
             selection = replace(selection, choices=(new,), end=fit)
             outcome = other
     return selection, outcome
-
-
-def _sets_by_simulation(
-    problem: GapProblem, selection: Selection, outcome: Outcome, jobs: int
-) -> tuple[Selection, Outcome]:
-    """Of two effects for which others could stand: these instead, if simulated windows
-    still show a gap and clearly less of one with them (equations do not say when what
-    sticks lets go). If windows show a gap with them alone, they are no tie."""
-    screen = selection.screen(problem)
-    for choice in selection.choices:
-        for rival in choice.sets:
-            if any(len(e.parameters) != 1 for e in rival.instead):
-                continue
-            gone = {(e.kind, tuple(e.at)) for e in (choice.effect, *rival.beside)}
-            rest = [
-                c for c in selection.choices
-                if (c.effect.kind, tuple(c.effect.at)) not in gone
-            ]  # fmt: skip
-            fixed = [*(c.fixed for c in rest), *(() for _ in rival.instead)]
-            start = [*(c.effect for c in rest), *rival.instead]
-            try:
-                fit = fit_effects(problem, screen, start, fixed)
-            except (ValueError, RuntimeError):
-                continue
-            other = problem.outcome(
-                fit.effects, selection.start, fit, selection.nuisances, jobs=jobs
-            )
-            if other is None:
-                continue
-            ours, theirs = outcome.gap.after, other.gap.after
-            gain = SIMULATED_RIVAL_GAIN
-            if ours > AGREEMENT_RMS_MAX and theirs < gain * ours:
-                old = " and ".join(map(called, (choice.effect, *rival.beside)))
-                margin = selection.end.score / fit.score - 1.0
-                new = [
-                    Choice(e, {}, choice.before, fit.score, old, margin, (), (), 1)
-                    for e in rival.instead
-                ]
-                chosen = refreshed([*rest, *new], fit)
-                return replace(selection, choices=tuple(chosen), end=fit), other
-            if theirs > AGREEMENT_RMS_MAX and ours < gain * theirs:
-                selection = _without_set(selection, rival)
-    return selection, outcome
-
-
-def _without_set(selection: Selection, rival: RivalSet) -> Selection:
-    choices = [
-        replace(c, sets=tuple(s for s in c.sets if s is not rival))
-        for c in selection.choices
-    ]
-    return replace(selection, choices=tuple(choices))

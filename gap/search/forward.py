@@ -19,7 +19,6 @@ from makebreak.gap.search.choice import (
     refreshed,
 )
 from makebreak.gap.search.comparison import Comparison
-from makebreak.gap.search.merge import merge
 from makebreak.gap.search.refine import refine
 from makebreak.gap.search.rivals import Rivals, in_place_of
 from makebreak.gap.thresholds import (
@@ -107,10 +106,9 @@ def _step(search: Comparison, rivals: Rivals, path: Path) -> Path:
     current = _converged(search, chosen, current)
     chosen = refreshed(chosen, current)  # The next fit starts from here.
     chosen, current = reweighed(search, chosen, current)
-    for of in (merge, refine):
-        chosen, current = search.if_time(
-            "improving the last effects", partial(of, search), chosen, current
-        )
+    chosen, current = search.if_time(
+        "improving the last effects", partial(refine, search), chosen, current
+    )
     return path.plus(State(tuple(chosen), current), step.table)
 
 

@@ -11,8 +11,6 @@ The stages, each in a file of its own:
     trials.py       exact fits, and which of them is the simplest
     rivals.py       needed instead, both needed, or a tie
     pairs.py        two effects at once
-    merge.py        one effect in the place of two
-    sets.py         ties of two effects together
     refine.py       a further parameter of an effect that is named
     drop.py         what is not needed, or not certain
 
@@ -41,7 +39,6 @@ from makebreak.gap.search.rivals import (
     with_rivals_of_pairs,
     with_shared_gains,
 )
-from makebreak.gap.search.sets import with_rival_sets
 from makebreak.models.effects.kind import Effect
 
 
@@ -91,8 +88,7 @@ def _with_ties(
         replace(c, ties=still_tied(search, chosen, current, k))
         for k, c in enumerate(chosen)
     ]
-    chosen = with_shared_gains(search, chosen, current)
-    return with_rival_sets(search, chosen, current)
+    return with_shared_gains(search, chosen, current)
 
 
 def without(problem: GapProblem, selection: Selection, *effects: Effect) -> Selection:
