@@ -30,6 +30,7 @@ from makebreak.diagrams.contact_mpc import ContactMpcConfig, make_contact_mpc
 from makebreak.systems.contact_mpc.lcs_builder import AnitescuLcs
 from makebreak.systems.contact_mpc.numerics.lcs import simulate
 from makebreak.systems.contact_mpc.residual_learner import (
+    AdamConfig,
     PosteriorConfig,
     ResidualLearner,
     ResidualLearnerConfig,
@@ -98,6 +99,7 @@ class Row:
     adapting: int | None = None
 
 
+BY_GRADIENT = dict(posterior=None, adam=AdamConfig(n_steps=5))
 ROWS = [
     Row("puck on a rail, 5 ms", [PUCK], ONE, [0.005]),
     Row("puck on a rail, 50 ms", [PUCK], ONE),
@@ -121,7 +123,7 @@ ROWS = [
         sensors=[Sensor(velocity_std=5e-3, outlier=1.0, lost=50)]),
     *(Row(f"puck, {whose} velocity 5 m/s off in 10 %{how}", [PUCK], (-5, 5),
           sensors=[Sensor(outlier=5.0, of=of)], learner=learner)
-      for how, learner in (("", {}), ("; gradient", dict(posterior=None, n_steps=5)))
+      for how, learner in (("", {}), ("; gradient", BY_GRADIENT))
       for of, whose in enumerate(("the finger's", "its"))),
     Row("disc, the finger's residual alone", [DISC], (-6, 6), adapting=1),
     Row("free box, all velocities weighted",

@@ -366,9 +366,9 @@ def _refuse_unused(config: BallRollingConfig) -> None:
     unused = ["contacts"]
     if config.contact_sequence == "sampled":
         # `contacts` has its own in place of those of the learner.
-        learner = ("weight_ball", "weight_tip", "eps", "posterior.drift")
+        learner = ("weight_ball", "weight_tip", "eps", "posterior.walk.drift")
         unused = ["task", "planner", *(f"learning.{name}" for name in learner)]
-        unused.append("learning.posterior.growth")
+        unused.append("learning.posterior.walk.growth")
     for name in unused:
         why = f"not used with contact_sequence={config.contact_sequence}"
         refuse_unused(config, plain, name, why)

@@ -40,11 +40,17 @@ from makebreak.systems.contact_mpc.numerics.c3_projections import (
 )
 from makebreak.systems.contact_mpc.parameter_learner import ParameterLearnerConfig
 from makebreak.systems.contact_mpc.residual_learner import (
+    AdamConfig,
+    FreeStatesConfig,
     PosteriorConfig,
     ResidualLearnerConfig,
+    WalkConfig,
 )
 from makebreak.systems.contact_mpc.rolling_task import RollingTaskConfig
-from makebreak.systems.perception.ball_tracker import BallTrackerConfig
+from makebreak.systems.perception.ball_tracker import (
+    BallMotionConfig,
+    BallTrackerConfig,
+)
 
 LEARN = 0.05  # Period of the learner, and time step of its LCS [s].
 PLAN_DT, TIP_MASS, N_TIP = 0.1, 1.0, 4  # N_TIP: forces of tip and ball, the first ones.
@@ -96,10 +102,10 @@ class LearnerConfig:
     posterior: PosteriorConfig = field(
         default_factory=lambda: PosteriorConfig(
             prior_std=0.16,
-            drift=0.02,
+            walk=WalkConfig(drift=0.02),
             spacing=0.01,
             misfit_sec=None,  # `trust` was chosen for this model's errors.
-            free_states=[V_BALL.start, V_BALL.start + 1],
+            free=FreeStatesConfig([V_BALL.start, V_BALL.start + 1]),
         )
     )
 
@@ -167,10 +173,12 @@ class BallRollingConfig:
     tracker: BallTrackerConfig = field(
         default_factory=lambda: BallTrackerConfig(
             position_std=1.5e-3,
-            acceleration_density=4e-3,
-            driven_density=0.3,
-            free_sec=2.0,
-            driven_sec=0.2,
+            motion=BallMotionConfig(
+                acceleration_density=4e-3,
+                driven_density=0.3,
+                free_sec=2.0,
+                driven_sec=0.2,
+            ),
         )
     )
     task: RollingTaskConfig = field(default_factory=RollingTaskConfig)
@@ -341,7 +349,9 @@ def learner_config(
     if from_beside is not None:
         eps = from_beside.learning_eps
         drift = from_beside.learning_drift
-        posterior = replace(posterior, drift=drift, growth=0.0)
+        posterior = replace(
+            posterior, walk=replace(posterior.walk, drift=drift, growth=0.0)
+        )
     return ResidualLearnerConfig(
         Q_d=Q_d.tolist(),
         eps=eps,
@@ -399,7 +409,6 @@ def paper_learner_config(n_lam: int) -> ResidualLearnerConfig:
         Q_d=Q_d.tolist(),
         eps=1e-7 / LEARN,
         gamma=1e-2 * LEARN,
-        n_b=10,
-        learning_rate=1e-3,
+        adam=AdamConfig(n_b=10, learning_rate=1e-3),
         groups=[[i] for i in range(n_lam)],
     )

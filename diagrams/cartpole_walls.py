@@ -45,6 +45,7 @@ from makebreak.systems.contact_mpc.numerics.cartpole import (
 )
 from makebreak.systems.contact_mpc.numerics.lcs import LCS
 from makebreak.systems.contact_mpc.residual_learner import (
+    AdamConfig,
     ResidualLearner,
     ResidualLearnerConfig,
 )
@@ -62,7 +63,7 @@ LEARNER_OFFSET, C3_OFFSET, PLANT_OFFSET = 1e-4, 2e-4, 3e-4
 def _learner() -> ResidualLearnerConfig:
     """Settings for gaps in metres: eps [m/N per squared SI unit], gamma [m/N]."""
     return ResidualLearnerConfig(
-        eps=30.0, gamma=0.01, n_b=10, learning_rate=3e-3, n_steps=5, r_max=0.5
+        eps=30.0, gamma=0.01, adam=AdamConfig(10, 3e-3, n_steps=5), r_max=0.5
     )
 
 
@@ -102,8 +103,10 @@ def refuse_unused_settings(config: CartpoleWallsConfig) -> None:
     if learned == "r_dyn":
         read.add("n_b")
     why = f"not used with {f'learner={learned}' if config.adapt else 'adapt=false'}"
-    for name in {one.name for one in fields(config.learning)} - read:
+    for name in {one.name for one in fields(config.learning)} - read - {"adam"}:
         refuse_unused(config, plain, f"learning.{name}", why)
+    for name in {"n_b", "learning_rate", "n_steps"} - read:
+        refuse_unused(config, plain, f"learning.adam.{name}", why)
 
 
 def true_lcs() -> LCS:
@@ -272,7 +275,7 @@ def _add_learners(
         baseline = builder.AddNamedSystem(
             "dynamics_learner",
             DynamicsResidualLearner(
-                DynamicsResidualLearnerConfig(config.learning.n_b),
+                DynamicsResidualLearnerConfig(config.learning.adam.n_b),
                 model,
                 DT,
                 LEARNER_OFFSET,

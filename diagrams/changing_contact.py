@@ -162,10 +162,11 @@ def refuse_unused_control(config, plain) -> None:
     else:
         why = "anticipator.speed.regression=false"
         unused["anticipator.speed.force_drift"] = why
-    if c.anticipator.speed.stiffness_most > 0.0:
-        unused["anticipator.speed.first"] = "anticipator.speed.stiffness_most > 0"
+    first = "anticipator.speed.first"
+    if c.anticipator.speed.first.stiffness_most > 0.0:
+        unused[f"{first}.speed"] = f"{first}.stiffness_most > 0"
     else:
-        unused["anticipator.speed.force_first"] = "anticipator.speed.stiffness_most=0"
+        unused[f"{first}.force"] = f"{first}.stiffness_most=0"
     if not c.shaper.region.anticipate:
         for name in ("sigmas", "margin", "settle_sec"):
             unused[f"shaper.region.{name}"] = "shaper.region.anticipate=false"

@@ -34,6 +34,7 @@ from makebreak.diagrams.wiring import refuse_changed, refuse_unused
 from makebreak.models.friction_zones import FrictionZone
 from makebreak.models.scene import Scene, read_scene
 from makebreak.systems.arm.surface_alignment import SurfaceAlignmentConfig
+from makebreak.systems.changing_contact.contact_anticipator import FirstApproachConfig
 from makebreak.systems.changing_contact.numerics.contact_task import (
     ContactBelief,
     ExpectedContact,
@@ -89,7 +90,8 @@ def _control() -> ChangingContactConfig:
         mean_wrench=True,
         align=SurfaceAlignmentConfig(angle_max_deg=1.5),
     )
-    speed = replace(config.anticipator.speed, first=TOUCH_SPEED)
+    first = FirstApproachConfig(speed=TOUCH_SPEED)
+    speed = replace(config.anticipator.speed, first=first)
     return replace(config, anticipator=replace(config.anticipator, speed=speed))
 
 

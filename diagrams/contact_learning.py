@@ -41,6 +41,7 @@ from makebreak.models.scene import Scene, read_scene
 from makebreak.systems.changing_contact.contact_anticipator import (
     ApproachSpeedConfig,
     ContactAnticipatorConfig,
+    FirstApproachConfig,
 )
 from makebreak.systems.changing_contact.contact_detector import ContactDetectorConfig
 from makebreak.systems.changing_contact.impact_reflex import ImpactReflexConfig
@@ -96,7 +97,8 @@ class ContactLearningConfig:
         default_factory=lambda: ChangingContactConfig(
             anticipator=ContactAnticipatorConfig(
                 speed=ApproachSpeedConfig(
-                    stiffness_most=STIFFNESS_RANGE[1], growth=10.0
+                    first=FirstApproachConfig(stiffness_most=STIFFNESS_RANGE[1]),
+                    growth=10.0,
                 )
             ),
             # Contacts are located to 0.1 mm here, so a smaller margin will do.

@@ -29,7 +29,10 @@ from makebreak.systems.contact_mpc.numerics.pivot_target import (
     corners,
 )
 from makebreak.systems.contact_mpc.pivot_target import PivotTargetConfig
-from makebreak.systems.contact_mpc.residual_learner import ResidualLearnerConfig
+from makebreak.systems.contact_mpc.residual_learner import (
+    AdamConfig,
+    ResidualLearnerConfig,
+)
 
 SCENE = str(MODELS / "cube_pivoting.scene.yaml")
 FINGERS = ("left", "right")
@@ -98,9 +101,7 @@ def _learner() -> ResidualLearnerConfig:
     return ResidualLearnerConfig(
         eps=300.0,
         gamma=2e-4,
-        n_b=10,
-        learning_rate=0.01,
-        n_steps=5,
+        adam=AdamConfig(n_b=10, learning_rate=0.01, n_steps=5),
         groups=[[0, 1], [2, 3], [4, 5, 6, 7]],
         r_max=1.0,
     )

@@ -63,6 +63,7 @@ from makebreak.systems.changing_contact.contact_anticipator import (
     ApproachSpeedConfig,
     ContactAnticipatorConfig,
     ContactFilterConfig,
+    FirstApproachConfig,
     KalmanContactAnticipator,
 )
 from makebreak.systems.changing_contact.contact_detector import (
@@ -174,7 +175,7 @@ class TouchConfig:
             # a degree rolls a centimetre meanwhile.
             speed=ApproachSpeedConfig(
                 force_desired=7.5,
-                first=0.015,
+                first=FirstApproachConfig(speed=0.015),
                 least=0.01,
                 most=0.03,
                 # Force over speed varies by a factor of two around the circle.
@@ -224,8 +225,8 @@ class GentleRollingConfig:
     touch: TouchConfig = field(default_factory=TouchConfig)
     push: PushMotionConfig = field(default_factory=PushMotionConfig)
     # Surface of the table: plain, or felt_and_glass: felt where y > 0.085 m, else
-    # glass. The latter replaces push.table_first, push.table_every, and press_table,
-    # slide and survey of push.shape.
+    # glass. The latter replaces push.table_first, push.table_every, and press, slide
+    # and survey of push.shape.table.
     table: str = "plain"
     # Errors of the station that the model lacks: none, lab or poor.
     realism: str = "none"
@@ -287,7 +288,8 @@ def on_two_surfaces(config: GentleRollingConfig) -> GentleRollingConfig:
     Raises: ValueError for a setting that is another one on this table.
     """
     refuse_changed("push", config.push, ("table_first", "table_every"))
-    refuse_changed("push.shape", config.push.shape, ("press_table", "slide", "survey"))
+    on_table = config.push.shape.table
+    refuse_changed("push.shape.table", on_table, ("press", "slide", "survey"))
     refuse_changed(
         "touch.forward_model.handover",
         config.touch.forward_model.handover,
@@ -296,7 +298,8 @@ def on_two_surfaces(config: GentleRollingConfig) -> GentleRollingConfig:
     angle = config.ball.start_angle_rad
     if angle is None:
         angle = float(np.random.default_rng([config.seed, 5]).uniform(*START_ANGLE))
-    shape = replace(config.push.shape, press_table=4.0, slide=0.07, survey=3)
+    on_table = replace(on_table, press=4.0, slide=0.07, survey=3)
+    shape = replace(config.push.shape, table=on_table)
     push = replace(config.push, shape=shape, table_first=2, table_every=8)
     models = config.touch.forward_model
     handover = replace(models.handover, from_rest=True)

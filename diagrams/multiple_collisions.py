@@ -44,6 +44,7 @@ from makebreak.models.scene import Scene, read_scene
 from makebreak.systems.changing_contact.contact_anticipator import (
     ApproachSpeedConfig,
     ContactAnticipatorConfig,
+    FirstApproachConfig,
 )
 from makebreak.systems.changing_contact.contact_detector import ContactDetectorConfig
 from makebreak.systems.changing_contact.impact_reflex import ImpactReflexConfig
@@ -122,9 +123,10 @@ class MultipleCollisionsConfig:
             anticipator=ContactAnticipatorConfig(
                 speed=ApproachSpeedConfig(
                     force_desired=7.0,
-                    stiffness_most=STIFFNESS_RANGE[1],
                     # The reflex is too late on the stiffest surfaces: 10 N at most.
-                    force_first=8.0,
+                    first=FirstApproachConfig(
+                        stiffness_most=STIFFNESS_RANGE[1], force=8.0
+                    ),
                     most=APPROACH_SPEED_MAX,
                     growth=4.0,  # The first measured impact decides already.
                 )

@@ -43,8 +43,10 @@ from makebreak.systems.contact_mpc.parameter_learner import ParameterLearnerConf
 from makebreak.systems.contact_mpc.push_goals import PushGoalsConfig
 from makebreak.systems.contact_mpc.push_task import PushTaskConfig
 from makebreak.systems.contact_mpc.residual_learner import (
+    FreeStatesConfig,
     PosteriorConfig,
     ResidualLearnerConfig,
+    WalkConfig,
 )
 from makebreak.systems.perception.pose_sensor import PoseSensorConfig
 from makebreak.systems.perception.pose_tracker import PoseTrackerConfig
@@ -128,10 +130,10 @@ class PushLearnerConfig:
     posterior: PosteriorConfig = field(
         default_factory=lambda: PosteriorConfig(
             prior_std=0.16,
-            drift=0.02,
+            walk=WalkConfig(drift=0.02),
             spacing=0.01,
             misfit_sec=None,  # `trust` was chosen for this model's errors.
-            free_states=[V_BALL.start, V_BALL.start + 1],
+            free=FreeStatesConfig([V_BALL.start, V_BALL.start + 1]),
         )
     )
 

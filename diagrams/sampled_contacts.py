@@ -109,9 +109,9 @@ class SampledContactsConfig:
     # Weight eps of the learner, in place of learning.eps [m/s N]: pushing from the side
     # takes far less force than from above, so a force over a gap has to cost more.
     learning_eps: float = 1e-4
-    # Drift of the learner's posterior, in place of posterior.drift [m/s / sqrt(s)]: at
-    # constant height the contact normal's slope is constant, and so is the gap
-    # residual.
+    # Drift of the learner's posterior, in place of posterior.walk.drift [m/s /
+    # sqrt(s)]: at constant height the contact normal's slope is constant, and so is the
+    # gap residual.
     learning_drift: float = 0.005
     # Length that is subtracted from the learned gap [m]: the camera's delay makes it
     # 1.5 to 3 mm too large, and the tip would strike the ball.

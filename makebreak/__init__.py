@@ -90,9 +90,12 @@ if TYPE_CHECKING:
         ParameterLearnerConfig as ParameterLearnerConfig,
     )
     from makebreak.systems.contact_mpc.residual_learner import (
+        AdamConfig as AdamConfig,
+        FreeStatesConfig as FreeStatesConfig,
         PosteriorConfig as PosteriorConfig,
         ResidualLearner as ResidualLearner,
         ResidualLearnerConfig as ResidualLearnerConfig,
+        WalkConfig as WalkConfig,
     )
     from makebreak.systems.perception.pose_tracker import (
         Marker as Marker,

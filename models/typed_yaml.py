@@ -7,6 +7,7 @@ and it has no nearest names, tuples or bounds. Without pydrake, so that it loads
 import dataclasses
 import difflib
 import math
+import re
 import types
 import typing
 from collections.abc import Iterable
@@ -137,8 +138,8 @@ def nearest(name: str, valid: Iterable[str]) -> str:
 
     if not valid:
         return "there is none"
-    # What was a prefix is a group now: roll_sec is roll.sec.
-    same = [v for v in valid if v.replace(".", "_") == name.replace(".", "_")]
+    # What was a prefix or an ending is a group now: roll_sec is roll.sec.
+    same = [v for v in valid if _words(v) == _words(name)]
     if len(same) == 1:
         return f"did you mean {same[0]}?"
     ranked = sorted(valid, key=likeness, reverse=True)
@@ -149,6 +150,10 @@ def nearest(name: str, valid: Iterable[str]) -> str:
     if len(valid) > LISTED_MAX:
         return f"nearest of {len(valid)}: {', '.join(ranked[:3])}"
     return f"expected one of: {', '.join(valid)}"
+
+
+def _words(name: str) -> list[str]:
+    return sorted(re.split("[._]", name))
 
 
 def shown(value) -> str:

@@ -727,6 +727,8 @@ def test_true_gap_is_the_radius_error_where_the_estimate_is_right(diagram):
         ("task.rolling.reposition.ease=0.7", "task.rolling.reposition.ease is 0.7"),
         ("world=nowhere.yaml", "nowhere.yaml does not exist"),
         ("radius_err=1", "did you mean radius_error_m"),
+        # What was a prefix or an ending is a group now.
+        ("learning.posterior.states_free=1", "mean learning.posterior.free.states?"),
     ],
 )
 def test_bad_settings_are_one_line_and_no_traceback(tmp_path, capfd, setting, message):

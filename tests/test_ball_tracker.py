@@ -22,6 +22,7 @@ from makebreak.systems.perception.ball_tracker import (
     PATIENCE,
     TRACKED,
     WRONG_IMAGE,
+    BallMotionConfig,
     BallTracker,
     BallTrackerConfig,
 )
@@ -393,8 +394,7 @@ def test_a_ball_that_rocks_is_followed_with_two_models_of_motion():
     off = {}
     for driven in (0.0, 0.3):
         rig = Rig(
-            position_std=1.5e-3, acceleration_density=4e-3, driven_density=driven,
-            free_sec=2.0, driven_sec=0.2,
+            position_std=1.5e-3, motion=BallMotionConfig(4e-3, driven, 2.0, 0.2)
         )  # fmt: skip
         errors = []
         for k in range(160):
@@ -528,9 +528,9 @@ def test_a_saved_context_replays_bit_for_bit():
         (dict(ball_radius=0.0), "ball_radius must be positive, got 0.0"),
         (dict(ball_radius=np.nan), "ball_radius is nan, expected a number"),
         (dict(position_std=-1e-3), "position_std must be positive, got -0.001"),
-        (dict(acceleration_density=0.0), "acceleration_density must be positive"),
-        (dict(driven_density=-1.0), "driven_density is -1.0, expected 0 or more"),
-        (dict(driven_sec=0.0), "driven_sec must be positive, got 0.0"),
+        (dict(motion=BallMotionConfig(0.0)), "acceleration_density must be positive"),
+        (dict(motion=BallMotionConfig(driven_density=-1.0)), "driven_density is -1.0"),
+        (dict(motion=BallMotionConfig(driven_sec=0.0)), "driven_sec must be positive"),
         (dict(table_z=0.9), "the camera at height 0.8 must be above the ball"),
         (dict(hue=np.inf), "hue must be finite, got inf"),
         (dict(period_sec=0.0), "period_sec is 0.0, expected a positive time"),

@@ -27,6 +27,7 @@ from makebreak.benchmarks.plants import (
     SQUEEZED,
     diagram_of,
 )
+from makebreak.systems.contact_mpc.residual_learner import AdamConfig
 
 RAIL = np.array([0.02, 0.21, 0.0, 0.0])  # Finger and puck, with radii of 5 cm each.
 
@@ -75,8 +76,9 @@ def test_a_learner_that_finds_the_gap_has_a_small_error():
     np.testing.assert_allclose(found.truth, 5e-3, atol=1e-9)
     assert found.error.max() < 2e-3 and found.within > 0.95 and found.better > 2.0
     # The same recording with a learner that may not learn: wrong by the whole error.
+    held = AdamConfig(learning_rate=1e-9)
     held = run(
-        Row("", [PUCK], (5,), learner=dict(posterior=None, learning_rate=1e-9)),
+        Row("", [PUCK], (5,), learner=dict(posterior=None, adam=held)),
         PUCK, [PUCK.world((5e-3,))], 0.05, Sensor(),
     )  # fmt: skip
     assert held.error.min() > 4.9e-3 and held.better < 1.1

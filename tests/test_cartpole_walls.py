@@ -216,8 +216,11 @@ def test_wrong_settings_are_refused_by_name(changes, message):
     [
         (["learning.slip_noise=0.1"], "slip_noise is 0.1, .* have no friction"),
         (["learner=none", "learning.r_max=0.3"], "not used with learner=none"),
-        (["learner=r_dyn", "learning.n_steps=2"], "not used with learner=r_dyn"),
-        (["adapt=false", "learning.n_b=5"], "n_b is 5, expected 10: .* adapt=false"),
+        (["learner=r_dyn", "learning.adam.n_steps=2"], "not used with learner=r_dyn"),
+        (
+            ["adapt=false", "learning.adam.n_b=5"],
+            "n_b is 5, expected 10: .* adapt=false",
+        ),
         (["adapt=false", "learner=both"], "learner is both"),
     ],
 )
@@ -232,9 +235,9 @@ def test_settings_that_the_learner_does_not_read_are_refused(
 @pytest.mark.parametrize(
     "settings",
     [
-        ["learning.gamma=0.005", "learning.n_b=5"],
-        ["learner=both", "learning.n_steps=2"],
-        ["learner=r_dyn", "learning.n_b=5"],
+        ["learning.gamma=0.005", "learning.adam.n_b=5"],
+        ["learner=both", "learning.adam.n_steps=2"],
+        ["learner=r_dyn", "learning.adam.n_b=5"],
         ["learner=none", "learning.eps=10"],  # Of the map of gradients.
     ],
 )

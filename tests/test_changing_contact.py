@@ -323,12 +323,12 @@ def test_settings_that_another_one_leaves_out_are_refused(module):
         with pytest.raises(ValueError, match=f"expected .*: not used with {without}"):
             task(setting, without)
         task(setting, chosen)
-    speed = "anticipator.speed"
-    used, other = "first=0.02", "force_first=5"
+    speed = "anticipator.speed.first"
+    used, other = "speed=0.02", "force=5"
     if module in (contact_learning, multiple_collisions):
         used, other = other, used
     task(f"{speed}.{used}")
     with pytest.raises(ValueError, match=f"not used with {speed}.stiffness_most"):
         task(f"{speed}.{other}")
-    stiffest = "0" if used.startswith("force") else "1e5"
+    stiffest = "0" if used == "force=5" else "1e5"
     task(f"{speed}.{other}", f"{speed}.stiffness_most={stiffest}")

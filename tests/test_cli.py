@@ -65,8 +65,15 @@ def test_json_is_one_document_and_the_rest_goes_to_stderr(capsys):
     assert rows["position_end_m"] == document["result"]["position_end_m"]
     assert "position_end_m" in told.err
     assert cli.main(["list", "spring_mass", "mass", "--json"]) == 0
-    keys = [each["key"] for each in json.loads(capsys.readouterr().out)["settings"]]
+    document = json.loads(capsys.readouterr().out)
+    assert document["tables"] == document["files"] == []  # Each document has both.
+    keys = [each["key"] for each in document["settings"]]
     assert keys == ["flown"]  # Whose meaning has the word.
+    assert run("--set", "mess=1", "--json") == 2
+    assert (
+        run("--set", "spring.stiffness=-1", "--json") == 2
+    )  # Found when the run has begun.
+    assert capsys.readouterr().out == ""
 
 
 def test_quiet_tells_errors_only(capsys):

@@ -11,6 +11,7 @@ from makebreak.systems.changing_contact.contact_anticipator import (
     ApproachSpeedConfig,
     ContactAnticipatorConfig,
     ContactFilterConfig,
+    FirstApproachConfig,
     KalmanContactAnticipator,
     KnownReflexConfig,
 )
@@ -195,7 +196,7 @@ def impact_force(v, k, m, rng, noise=0.0):
 @pytest.mark.parametrize("first", [0.05, 0.003])
 def test_regression_reaches_the_desired_force_at_any_stiffness(stiffness, first):
     rng = np.random.default_rng(7)
-    s = ApproachSpeedConfig(first=first)
+    s = ApproachSpeedConfig(first=FirstApproachConfig(first))
     v, impacts, forces = first, [], []
     for _ in range(20):
         forces.append(impact_force(v, stiffness, 5.0, rng, 0.2))
@@ -240,7 +241,8 @@ def test_what_was_never_felt_is_met_as_the_stiffest_surface_asks(gain):
         return 9.0 if abs(d[2]) > 0.5 else 4.0
 
     speed = ApproachSpeedConfig(
-        stiffness_most=1e5, force_first=6.0, reflex=KnownReflexConfig(gain, 2.0)
+        first=FirstApproachConfig(stiffness_most=1e5, force=6.0),
+        reflex=KnownReflexConfig(gain, 2.0),
     )
     wall = ExpectedContact([0.5, 0.3, 0], 0.08**2 * np.eye(3), RIGHT, segment=1)
     config = ContactAnticipatorConfig(speed=speed)
@@ -532,7 +534,9 @@ def test_an_impact_counts_with_the_speed_that_was_planned_where_there_was_one():
 
 
 def test_the_first_stiffness_is_carried_over_to_contacts_not_felt():
-    config = ContactAnticipatorConfig(speed=ApproachSpeedConfig(carry_over=True))
+    config = ContactAnticipatorConfig(
+        speed=ApproachSpeedConfig(first=FirstApproachConfig(carry_over=True))
+    )
     wall = ExpectedContact([0.5, 0.3, 0], 0.08**2 * np.eye(3), RIGHT, segment=1)
 
     def mass(p, d):
@@ -789,8 +793,10 @@ def test_a_file_that_is_no_belief_is_refused(tmp_path, text, words):
             "std_along is 0.0, expected a positive",
         ),
         (
-            ContactAnticipatorConfig(speed=ApproachSpeedConfig(first=np.nan)),
-            "first is nan",
+            ContactAnticipatorConfig(
+                speed=ApproachSpeedConfig(first=FirstApproachConfig(np.nan))
+            ),
+            "first.speed is nan",
         ),
         (
             ContactAnticipatorConfig(speed=ApproachSpeedConfig(growth=0.5)),

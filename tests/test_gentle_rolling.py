@@ -51,6 +51,7 @@ from makebreak.systems.changing_contact.numerics.push_motion import (
     BALL_SEGMENT,
     TABLE_SEGMENT,
     PushConfig,
+    TableConfig,
     ball_pattern,
     frame_at,
     frame_under,
@@ -132,7 +133,7 @@ def test_the_way_to_the_table_ends_ahead_of_the_ball_and_slides_away_from_it():
 
 
 def test_a_survey_rests_and_then_goes_to_and_fro_into_the_circle():
-    shape = PushConfig(survey=3, slide=0.07)
+    shape = PushConfig(table=TableConfig(survey=3, slide=0.07))
     pattern = table_pattern(shape, IN_FRONT, HEADING, R_BALL, R_TIP, 5.0)
     assert len(pattern) == 6 and pattern.ends_in_contact(TABLE_SEGMENT)
     down = pattern.segments[TABLE_SEGMENT].positions[1]
@@ -233,7 +234,9 @@ def test_the_table_waits_until_the_arm_would_not_hide_the_ball():
 
 @pytest.mark.parametrize("survey", [0, 3])
 def test_a_survey_is_made_in_a_frame_that_comes_to_rest(survey):
-    push = PushMotionConfig(shape=PushConfig(survey=survey), table_first=1)
+    push = PushMotionConfig(
+        shape=PushConfig(table=TableConfig(survey=survey)), table_first=1
+    )
     tick, y = motion_system(push=push), []
     for k in range(1, 61):
         t = 0.0125 * k + 1e-6
@@ -500,8 +503,10 @@ def test_felt_begins_at_the_seam_and_the_models_have_none():
 
 def test_settings_that_felt_and_glass_replaces_are_refused():
     changed = GentleRollingConfig()
-    changed.push.shape.survey = 2
-    with pytest.raises(ValueError, match="push.shape.survey is 2, .*the diagram sets"):
+    changed.push.shape.table.survey = 2
+    with pytest.raises(
+        ValueError, match="push.shape.table.survey is 2, .*the diagram sets"
+    ):
         on_two_surfaces(changed)
 
 

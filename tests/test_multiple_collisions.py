@@ -134,7 +134,7 @@ def test_the_bound_of_the_extra_time_is_that_of_creeping_at_the_fastest_impacts(
     # 10 N at 2e5 N/m and 3 to 8 kg without any braking: 8 to 13 mm/s; with it more.
     assert np.all(speeds > 0.008) and np.all(speeds < 0.02)
     soft = replace(config, stiffness=[2e4, 2e4])
-    soft.control.anticipator.speed.stiffness_most = 2e4
+    soft.control.anticipator.speed.first.stiffness_most = 2e4
     assert np.all(extra_time_bound(task, soft)[1] > speeds)
 
 

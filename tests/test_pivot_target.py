@@ -99,8 +99,6 @@ def test_the_system_asks_for_no_turn_before_the_fingers_are_there():
     [
         (dict(side=0.0), "side is 0.0, expected > 0"),
         (dict(rate=-1.0), "rate is -1.0, expected > 0"),
-        (dict(left_at=0.6), "left_at is 0.6, expected -0.5 to 0.5"),
-        (dict(near=0.1), "near is 0.1 and far 0.06"),
         (dict(goal=np.nan), "goal is nan"),
     ],
 )

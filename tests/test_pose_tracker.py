@@ -398,8 +398,8 @@ def test_position_and_yaw_are_filtered_by_their_own_standard_deviations():
         follower.show(photograph(np.array([0.5, 0.0, 0.4])))
     expected = []
     for sigma, speed, density in (
-        (c.position_std, START_SPEED, c.acceleration_density),
-        (c.yaw_std, START_RATE, c.turning_density),
+        (c.position_std, START_SPEED, c.motion.acceleration_density),
+        (c.yaw_std, START_RATE, c.motion.turning_density),
     ):
         P, zero = np.array([sigma**2, 0.0, speed**2]), np.zeros(2)
         *_, P = constant_velocity.predict(zero, zero, P, c.period_sec, density)

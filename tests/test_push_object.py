@@ -63,7 +63,11 @@ from makebreak.systems.perception.numerics.pose_filter import (
     turn_between,
     turned,
 )
-from makebreak.systems.perception.pose_sensor import PoseSensor, PoseSensorConfig
+from makebreak.systems.perception.pose_sensor import (
+    ObjectMotionConfig,
+    PoseSensor,
+    PoseSensorConfig,
+)
 from makebreak.systems.views.contact_probe import ContactLoad
 
 POSE = [1.0, 0.0, 0.0, 0.0, 0.5, 0.0, 0.02]
@@ -196,7 +200,9 @@ def test_a_reading_that_is_older_than_what_is_kept_is_still_the_last():
 
 
 def test_readings_have_the_noise_that_is_asked_for():
-    diagram, sensor = sensor_at(RigidTransform([0.5, 0.0, 0.02]), density=[1e6, 1e6])
+    diagram, sensor = sensor_at(
+        RigidTransform([0.5, 0.0, 0.02]), motion=ObjectMotionConfig([1e6, 1e6])
+    )
     simulator = Simulator(diagram)
     own = sensor.GetMyContextFromRoot(simulator.get_context())
     seen = []

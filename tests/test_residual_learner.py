@@ -30,6 +30,7 @@ from makebreak.systems.contact_mpc.numerics.residual_learner import (
     zero_residual,
 )
 from makebreak.systems.contact_mpc.residual_learner import (
+    AdamConfig,
     LearnerStatus,
     ResidualLearner,
     ResidualLearnerConfig,
@@ -403,7 +404,7 @@ def test_before_two_samples_r_is_zero_and_status_says_waiting():
 
 
 def test_learns_the_gap_error_over_dt():
-    config = ResidualLearnerConfig(eps=1e-1, n_steps=5, Q_d=[0.0, 1e3])
+    config = ResidualLearnerConfig(eps=1e-1, adam=AdamConfig(n_steps=5), Q_d=[0.0, 1e3])
     simulator, learner = scripted(n=60, config=config)
     after_tick(simulator, 59)
     r, loss, _ = outputs(simulator, learner)
@@ -641,12 +642,12 @@ def test_arrays_may_stand_for_lists():
         (dict(Q_d=[1.0]), r"Q_d is \[1.0\], expected 2 weights"),
         (dict(Q_d=[1.0, -1.0]), "Q_d"),
         (dict(eps=0.0), "eps is 0.0"),
-        (dict(learning_rate=-1.0), "learning_rate is -1.0"),
+        (dict(adam=AdamConfig(learning_rate=-1.0)), "learning_rate is -1.0"),
         (dict(r_max=np.inf), "r_max is inf"),
-        (dict(n_b=0), "n_b is 0"),
-        (dict(n_steps=0), "n_steps is 0"),
-        (dict(n_b=2.5), "n_b is 2.5, expected an integer"),
-        (dict(n_steps=np.inf), "n_steps is inf"),
+        (dict(adam=AdamConfig(n_b=0)), "n_b is 0"),
+        (dict(adam=AdamConfig(n_steps=0)), "n_steps is 0"),
+        (dict(adam=AdamConfig(n_b=2.5)), "n_b is 2.5, expected an integer"),
+        (dict(adam=AdamConfig(n_steps=np.inf)), "n_steps is inf"),
         (dict(groups=[[1]]), "entry 1"),
         (dict(groups=[[0.5]]), r"groups\[0\]\[0\] is 0.5, expected an integer"),
         (dict(groups=[0]), r"groups\[0\] is 0, expected a list"),

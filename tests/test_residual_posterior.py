@@ -36,10 +36,12 @@ from makebreak.systems.contact_mpc.numerics.residual_posterior import (
     updated,
 )
 from makebreak.systems.contact_mpc.residual_learner import (
+    FreeStatesConfig,
     LearnerStatus,
     PosteriorConfig,
     ResidualLearner,
     ResidualLearnerConfig,
+    WalkConfig,
 )
 
 GRID = residual_grid(r_max=0.7, spacing=0.01, prior_std=0.16, drift_std=0.01)
@@ -259,7 +261,7 @@ def test_a_ball_that_rocks_by_itself_says_little_of_the_gap(builder, watched):
         all_lcs.append(builder.build(row, np.zeros(3)))
     config = learner_config(LearnerConfig())
     if not watched:
-        config.posterior = replace(config.posterior, free_states=[])
+        config.posterior = replace(config.posterior, free=FreeStatesConfig())
     r, std, _ = learned(config, np.array(x), np.array(u), all_lcs)
     if watched:
         assert abs(r) < 0.003 and abs(r) < std
@@ -356,7 +358,7 @@ def test_what_moves_a_free_state_is_learned_only_where_nothing_touches(gaps, is_
     """Nothing: no wall within two deviations of its residual. Gaps in deviations."""
     model, x, u = between_walls(0.1, 0.1), np.zeros(2), np.zeros(1)
     config = ResidualLearnerConfig(
-        Q_d=[0.0, 1e4], eps=1e-3, posterior=PosteriorConfig(free_states=[1])
+        Q_d=[0.0, 1e4], eps=1e-3, posterior=PosteriorConfig(free=FreeStatesConfig([1]))
     )
     learner = ResidualLearner(config, model, LEARN, 1e-2 * LEARN)
     memory = learner._memory_of(learner.CreateDefaultContext())
@@ -388,7 +390,9 @@ def test_what_was_learned_stays_where_nothing_is_touched(error):
     x, u = visits(truth, [3.0] * 40)
     away = np.tile([0.03 + error - 3e-3, 0.0], (3000, 1))
     x, u = np.vstack([x, away]), np.vstack([u, np.zeros((3000, 1))])
-    first, after, last = follow(model, x, u, [39, 100, 3039], hold_sec=2.0)
+    first, after, last = follow(
+        model, x, u, [39, 100, 3039], walk=WalkConfig(hold_sec=2.0)
+    )
     assert abs(first[0][1] - error) < 5e-4
     # It may walk for two seconds, in which a large residual shrinks by a few percent.
     assert abs(after[0][1] - error) < 1e-3
@@ -557,23 +561,28 @@ def test_a_part_of_a_contacts_entries_is_refused(builder, groups):
         ResidualLearner(ResidualLearnerConfig(groups=groups), lcs, LEARN)
 
 
+def walking(**walk):
+    return dict(posterior=PosteriorConfig(walk=WalkConfig(**walk)))
+
+
+def with_free(*free):
+    return dict(posterior=PosteriorConfig(free=FreeStatesConfig(*free)))
+
+
 @pytest.mark.parametrize(
     "changes, message",
     [
-        (dict(posterior=PosteriorConfig(hold_sec=np.nan)), "hold_sec is nan"),
+        (walking(hold_sec=np.nan), "hold_sec is nan"),
         (dict(posterior=PosteriorConfig(misfit_sec=0.0)), "misfit_sec is 0.0"),
         (dict(posterior=PosteriorConfig(spacing=1e-5)), "spacing is 1e-05, expected"),
         (dict(posterior=PosteriorConfig(spacing=0.5)), "spacing is 0.5, expected"),
-        (
-            dict(posterior=PosteriorConfig(free_states=[1.5])),
-            r"free_states\[0\] is 1.5, expected an integer",
-        ),
+        (with_free([1.5]), r"free.states\[0\] is 1.5, expected an integer"),
         (dict(posterior=PosteriorConfig(), Q_d=[]), "Q_d is empty, expected"),
         (dict(posterior=PosteriorConfig(trust=0.0)), "posterior.trust is 0.0"),
-        (dict(posterior=PosteriorConfig(drift=np.nan)), "posterior.drift is nan"),
-        (dict(posterior=PosteriorConfig(growth=-1.0)), "posterior.growth is -1.0"),
-        (dict(posterior=PosteriorConfig(free_sec=0.0)), "posterior.free_sec is 0.0"),
-        (dict(posterior=PosteriorConfig(free_states=[19])), "free_states names 19"),
+        (walking(drift=np.nan), "posterior.walk.drift is nan"),
+        (walking(growth=-1.0), "posterior.walk.growth is -1.0"),
+        (with_free([], 0.0), "posterior.free.average_sec is 0.0"),
+        (with_free([19]), "posterior.free.states names 19"),
         (dict(slip_noise=-0.1), "slip_noise is -0.1, expected 0 or more"),
     ],
 )

@@ -509,8 +509,8 @@ def _set(config, setting, value):
         ({"contact_sequence": "sampled"}, "task.circle.speed", 0.03),
         ({"contact_sequence": "sampled"}, "planner.options.N", 6),
         ({"contact_sequence": "sampled"}, "learning.eps", 1e-4),
-        ({"contact_sequence": "sampled"}, "learning.posterior.drift", 0.01),
-        ({"controller": "paper"}, "learning.posterior.hold_sec", 3.0),
+        ({"contact_sequence": "sampled"}, "learning.posterior.walk.drift", 0.01),
+        ({"controller": "paper"}, "learning.posterior.walk.hold_sec", 3.0),
     ],
 )
 def test_a_setting_that_the_chosen_parts_do_not_read_is_refused(choice, setting, value):

@@ -51,7 +51,7 @@ def test_every_setting_is_there_and_its_default_changes_nothing(experiment):
 def test_a_word_selects_settings_and_a_wrong_one_is_refused(capsys):
     assert cli.main(["list", "cartpole_walls", "Learning_Rate"]) == 0
     out = capsys.readouterr().out
-    assert "learning.learning_rate=0.003 " in out and "gap_error" not in out
+    assert "learning.adam.learning_rate=0.003 " in out and "gap_error" not in out
     assert cli.main(["list", "cartpole_walls", "xyz"]) == 2
     assert 'no setting has "xyz" in its name' in capsys.readouterr().err
     assert cli.main(["list", "cartpol"]) == 2

@@ -16,6 +16,7 @@ with ``makebreak`` are what you would type in a terminal.
 # knows of no friction. The "real" arm has 0.3 N m of Coulomb friction in its second
 # joint.
 
+import contextlib
 import os
 import shlex
 import subprocess
@@ -73,12 +74,20 @@ record("monday.csv", friction=0.3, load=1e-6, seed=1)
 
 
 def terminal(command):
-    """Runs a command of makebreak, and shows what it prints."""
+    """Runs a command of makebreak, and shows what it prints in a terminal."""
     words = [sys.executable, "-m", *shlex.split(command)]
     wide = os.environ | {"COLUMNS": "84"}  # As wide as this page.
-    done = subprocess.run(words, cwd=folder, capture_output=True, text=True, env=wide)
-    assert done.returncode == 0, done.stderr
-    print(done.stdout)
+    reader, writer = os.openpty()
+    run = subprocess.Popen(words, cwd=folder, env=wide, stdout=writer, stderr=-1)
+    os.close(writer)
+    printed = b""
+    with contextlib.suppress(OSError):  # The terminal is closed: all is printed.
+        while more := os.read(reader, 4096):
+            printed += more
+    os.close(reader)
+    errors = run.communicate()[1].decode()
+    assert run.returncode == 0, errors
+    print(printed.decode().replace("\r\n", "\n"))
 
 
 # %%

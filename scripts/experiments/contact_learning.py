@@ -353,8 +353,8 @@ VARIANTS: dict[str, dict] = {
     "realism lab": {"realism": "lab"},
     "eq. 9 for the speed": {f"{APPROACH}.regression": False},
     "50 mm/s first, whatever the stiffness": {
-        f"{APPROACH}.first": 0.05,
-        f"{APPROACH}.stiffness_most": 0.0,
+        f"{APPROACH}.first.speed": 0.05,
+        f"{APPROACH}.first.stiffness_most": 0.0,
     },
 }
 

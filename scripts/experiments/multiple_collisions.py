@@ -161,7 +161,7 @@ def scored(log: dict[str, np.ndarray], task: CollisionTask) -> CollisionTrial:
 
 def is_told(config: MultipleCollisionsConfig) -> bool:
     """Whether the anticipator knows how stiff the surfaces are."""
-    most = config.control.anticipator.speed.stiffness_most
+    most = config.control.anticipator.speed.first.stiffness_most
     return all(k == most for k in config.stiffness)
 
 
@@ -194,7 +194,9 @@ def extra_time_bound(task: CollisionTask, config) -> tuple[float, np.ndarray]:
     Returns: [s], and (4,) [m/s].
     """
     reach = ArmReach(make_control_plant(task.model, TOOL))
-    most = config.control.anticipator.speed.stiffness_most or max(config.stiffness)
+    most = config.control.anticipator.speed.first.stiffness_most or max(
+        config.stiffness
+    )
     force = TOLD_MAX if is_told(config) else FIRST_MAX
     speeds = []
     for c in task.prior.contacts:
@@ -296,8 +298,8 @@ VARIANTS: dict[str, dict] = {
     "sphere, realism lab": {"tool": "sphere", "realism": "lab"},
     TOLD: {
         "stiffness": [2e4, 2e4],
-        f"{SPEEDS}.stiffness_most": 2e4,
-        f"{SPEEDS}.force_first": 6.0,
+        f"{SPEEDS}.first.stiffness_most": 2e4,
+        f"{SPEEDS}.first.force": 6.0,
     },
 }
 

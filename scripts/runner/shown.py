@@ -75,8 +75,9 @@ def telling(command: str, args: Namespace) -> Iterator[Callable[[int], None]]:
     _quiet = quiet
 
     def ended(status: int) -> None:
-        if as_json:
-            document = {"command": command, "status": status} | _facts
+        if as_json and status not in (2, 3):  # Bad input, a bug: only the message.
+            document: dict[str, Any] = {"command": command, "status": status}
+            document |= {"tables": [], "files": []} | _facts
             for file in map(Path, _facts.get("files", [])):
                 if file.name == _RESULT:
                     document["result"] = json.loads(file.read_text())

@@ -95,20 +95,25 @@ class KnownReflexConfig:
 
 
 @dataclass
+class FirstApproachConfig:
+    """Of a contact that has not been felt."""
+
+    speed: float = 0.05  # Approach speed v_a, if stiffness_most is 0 [m/s].
+    # Stiffness of the stiffest contact that there may be [N/m]: the approach speed is
+    # that at which it gives `force`, with the arm's effective mass; 0: `speed` is used.
+    stiffness_most: float = 0.0
+    force: float = 8.0  # Peak force of an impact on a contact of stiffness_most [N].
+    # Whether the first stiffness that is felt is assumed of all other contacts.
+    carry_over: bool = False
+
+
+@dataclass
 class ApproachSpeedConfig:
     """How fast a contact is approached, and how that is learned from impacts."""
 
     # Desired peak force F_d of an impact, along the motion [N].
     force_desired: float = 8.0
-    # Approach speed v_a of a contact that has not been felt, if stiffness_most is 0
-    # [m/s].
-    first: float = 0.05
-    # Stiffness of the stiffest contact that there may be [N/m]: the first approach
-    # speed is that at which it gives force_first, with the arm's effective mass; 0:
-    # `first` is used.
-    stiffness_most: float = 0.0
-    # Peak force of the first impact on a contact of stiffness_most [N].
-    force_first: float = 8.0
+    first: FirstApproachConfig = field(default_factory=FirstApproachConfig)
     reflex: KnownReflexConfig = field(default_factory=KnownReflexConfig)
     # Whether the next approach speed follows from a regression F = s v over all
     # impacts; false: from eq. 9.
@@ -122,9 +127,6 @@ class ApproachSpeedConfig:
     growth: float = 1.4
     least: float = 0.001  # Smallest approach speed after a contact was felt [m/s].
     most: float = 0.2  # Largest approach speed [m/s].
-    # Whether the first stiffness that is felt is assumed of all contacts that have not
-    # been felt.
-    carry_over: bool = False
 
 
 @dataclass
@@ -176,13 +178,14 @@ def reduced_mass_one(p, d) -> float:
 
 def first_speed(config: ApproachSpeedConfig, p, d, effective_mass) -> float:
     """v_a [m/s] of a contact that was never felt, at p (3,) along d (3,)."""
-    speed = config.first
-    if config.stiffness_most > 0.0:
+    first = config.first
+    speed = first.speed
+    if first.stiffness_most > 0.0:
         mass = effective_mass(p, d)
         force = unbraked_force(
-            config.force_first, config.reflex.gain, config.reflex.force_least
+            first.force, config.reflex.gain, config.reflex.force_least
         )
-        speed = impact_speed(force, config.stiffness_most, mass)
+        speed = impact_speed(force, first.stiffness_most, mass)
     return float(min(speed, config.most))
 
 
@@ -239,7 +242,8 @@ class KalmanContactAnticipator(LeafSystem):
         check_settings(config)
         self._filter, self._speed = replace(config.filter), replace(config.speed)
         speed = dict(vars(config.speed))
-        numbers = {**vars(config.filter), **vars(speed.pop("reflex")), **speed}
+        parts = (config.filter, speed.pop("reflex"), speed.pop("first"))
+        numbers = {k: v for part in parts for k, v in vars(part).items()} | speed
         for name, value in numbers.items():
             if isinstance(value, bool):
                 continue
@@ -493,7 +497,7 @@ class KalmanContactAnticipator(LeafSystem):
         belief = memory.belief.changed(
             k, impacts=impacts, approach_speed=self._next_speed(known, impacts)
         )
-        if self._speed.carry_over:
+        if self._speed.first.carry_over:
             belief = self._carried_over(belief, k)
         return replace(memory, belief=belief, last=-1)
 

@@ -204,7 +204,7 @@ class PushMotion(LeafSystem):
         turned = push.heading - self._path.heading(p)
         goal = p + c.shape.land_behind * np.append(turned, 0.0)
         phase = self._phase.Eval(context)
-        surveys = push.kind == TABLE and c.shape.survey > 0
+        surveys = push.kind == TABLE and c.shape.table.survey > 0
         if surveys and phase[PHASE_SEGMENT] > TABLE_SEGMENT:
             # What lies still is surveyed, in a frame that comes to rest.
             goal, v = frame_at(push.frame, t), np.zeros(3)
@@ -249,11 +249,12 @@ class PushMotion(LeafSystem):
 
 def _check(config: PushMotionConfig) -> None:
     """Raises: ValueError by name."""
-    for name, value in vars(config.shape).items():
-        if name == "survey":
-            if value != int(value) or value < 0:
-                raise ValueError(f"push.shape.survey is {value}, expected 0, 1, ...")
-        elif not 0.0 < value < np.inf:
+    table = {f"table.{name}": value for name, value in vars(config.shape.table).items()}
+    survey = table.pop("table.survey")
+    if survey != int(survey) or survey < 0:
+        raise ValueError(f"push.shape.table.survey is {survey}, expected 0, 1, ...")
+    for name, value in (vars(config.shape) | table).items():
+        if name != "table" and not 0.0 < value < np.inf:
             raise ValueError(f"push.shape.{name} is {value}, expected > 0")
     for name in ("settle_sec", "follow_sec", "give_up_sec"):
         if not 0.0 < getattr(config, name) < np.inf:

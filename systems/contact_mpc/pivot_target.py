@@ -13,6 +13,13 @@ from makebreak.systems.contact_mpc.numerics.pivot_target import (
 )
 from makebreak.systems.numerics.settings import check_settings
 
+# Where the fingers touch: distance from the middle of the face over the side, the left
+# finger's upwards, the right one's to the right (on the upper face).
+LEFT_AT, RIGHT_AT = 0.2, 0.15
+# The rate is full while both fingers are nearer than NEAR to their places, and zero
+# beyond FAR [m].
+NEAR, FAR = 0.03, 0.06
+
 
 @dataclass
 class PivotTargetConfig:
@@ -22,14 +29,6 @@ class PivotTargetConfig:
     finger_radius: float = 0.012  # [m]
     goal: float = np.pi / 2  # Angle of the cube [rad].
     rate: float = 1.0  # Of the angle towards the goal [rad/s].
-    # Where the fingers touch: distance from the middle of the face over the side, the
-    # left finger's upwards, the right one's to the right (on the upper face).
-    left_at: float = 0.2
-    right_at: float = 0.15
-    # The rate is full while both fingers are nearer than `near` to their places, and
-    # zero beyond `far` [m].
-    near: float = 0.03
-    far: float = 0.06
 
 
 class PivotTarget(LeafSystem):
@@ -51,29 +50,16 @@ class PivotTarget(LeafSystem):
                 raise ValueError(
                     f"PivotTargetConfig.{name} is {getattr(c, name)}, expected > 0"
                 )
-        for name in ("left_at", "right_at"):
-            if not -0.5 <= getattr(c, name) <= 0.5:
-                raise ValueError(
-                    f"PivotTargetConfig.{name} is {getattr(c, name)}, expected -0.5 to "
-                    "0.5 of the side"
-                )
-        if not 0.0 <= c.near < c.far:
-            raise ValueError(
-                f"PivotTargetConfig.near is {c.near} and far {c.far}, expected "
-                "0 <= near < far"
-            )
         if not np.isfinite(c.goal):
             raise ValueError(f"PivotTargetConfig.goal is {c.goal}, expected an angle")
         self._config, self._dt, self._N = c, dt_sec, N
         out = 0.5 * c.side + c.finger_radius
-        self._points = np.array(
-            [[-out, c.left_at * c.side], [c.right_at * c.side, out]]
-        )
+        self._points = np.array([[-out, LEFT_AT * c.side], [RIGHT_AT * c.side, out]])
         self._x = self.DeclareVectorInputPort("x", N_X)
         self.DeclareVectorOutputPort("x_desired", (N + 1) * N_X, self._calc)
 
     def _calc(self, context: Context, output: BasicVector):
         c, q = self._config, self._x.Eval(context)[: N_X // 2]
-        rate = c.rate * share_of_rate(fingers_away(q, self._points), c.near, c.far)
+        rate = c.rate * share_of_rate(fingers_away(q, self._points), NEAR, FAR)
         rows = pivot_target(q, c.side, self._points, c.goal, rate, self._dt, self._N)
         output.SetFromVector(rows.ravel())

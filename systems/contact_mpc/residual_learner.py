@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -54,36 +55,59 @@ GRID_MAX = 2001  # Largest number of residuals on the grid.
 
 
 @dataclass
+class WalkConfig:
+    """How the residual may change: a random walk."""
+
+    # Standard deviation of the walk after one second of contact [m/s / sqrt(s)]; null:
+    # that of a gap of 1 mm.
+    drift: float | None = None
+    # Standard deviation that is added to the drift in proportion to the residual's own
+    # size [1 / sqrt(s)].
+    growth: float = 0.08
+    # Time after the last contact after which the residual no longer walks [s].
+    hold_sec: float = 2.0
+
+
+@dataclass
+class FreeStatesConfig:
+    """States that also change for reasons that no model has (an object that rocks): the
+    variance of these changes bounds their weight."""
+
+    states: list[int] = field(default_factory=list)  # Their indices.
+    # Time over which that variance is averaged, while nothing can touch [s].
+    average_sec: float = 2.0
+
+
+@dataclass
 class PosteriorConfig:
     """The residual's probability on a grid (numerics/residual_posterior.py)."""
 
     # Standard deviation of the residual's prior, whose mean is zero [m/s]; null: that
     # of a gap of 8 mm.
     prior_std: float | None = None
-    # Standard deviation of the residual's random walk after one second of contact [m/s
-    # / sqrt(s)]; null: that of a gap of 1 mm.
-    drift: float | None = None
-    # Standard deviation that is added to the drift in proportion to the residual's own
-    # size [1 / sqrt(s)].
-    growth: float = 0.08
+    walk: WalkConfig = field(default_factory=WalkConfig)
     # Spacing of the grid of residuals [m/s]; null: that of gaps of 0.5 mm.
     spacing: float | None = None
     # Factor on the loss of a step; below 1, as the errors of steps are correlated.
     trust: float = 0.2
     loss_max: float = 20.0  # Largest loss of a step, against outliers.
-    # Indices of states that also change for reasons that no model has (an object that
-    # rocks): the variance of these changes bounds their weight.
-    free_states: list[int] = field(default_factory=list)
-    # Time over which the variance of the free states' changes is averaged, while
-    # nothing can touch [s].
-    free_sec: float = 2.0
-    # Time after the last contact after which the residual no longer walks [s].
-    hold_sec: float = 2.0
+    free: FreeStatesConfig = field(default_factory=FreeStatesConfig)
     # Time over which the loss that no residual explains is averaged, while a contact is
     # felt [s]. Where it is s times what noise with these Q_d would leave, the model is
     # wrong elsewhere (a mass, a friction) and stays so: trust is divided by s^2. null:
     # trust is fixed.
     misfit_sec: float | None = 1.0
+
+
+@dataclass
+class AdamConfig:
+    """Gradient steps on the mean loss of the last measured steps."""
+
+    n_b: int = 10  # Number of measured steps in the buffer.
+    # Learning rate, about the change of r_comp per step [m/s] (cartpole_walls: [m]);
+    # null: 0.15 mm of the gap.
+    learning_rate: float | None = None
+    n_steps: int = 1  # Number of Adam's steps per update.
 
 
 @dataclass
@@ -98,11 +122,7 @@ class ResidualLearnerConfig:
     # Softness gamma of the contact equation [m/s per N]; null: the paper's, 0.01 times
     # the time step.
     gamma: float | None = None
-    n_b: int = 10  # Number of measured steps in the buffer.
-    # Learning rate of Adam, about the change of r_comp per step [m/s] (cartpole_walls:
-    # [m]); null: 0.15 mm of the gap.
-    learning_rate: float | None = None
-    n_steps: int = 1  # Number of Adam's steps per update.
+    adam: AdamConfig = field(default_factory=AdamConfig)
     # Entries of r_comp that share one value, as lists of indices; entries in no list
     # stay zero; empty: each entry has its own value.
     groups: list[list[int]] = field(default_factory=list)
@@ -114,8 +134,7 @@ class ResidualLearnerConfig:
     # paper.
     slip_noise: float = np.inf
     # Posterior of each group's residual: r_comp is its mode instead of Adam's result,
-    # Q_d are inverse variances, and n_b, learning_rate and n_steps are not used; null:
-    # Adam.
+    # Q_d are inverse variances, and adam is not used; null: Adam.
     posterior: PosteriorConfig | None = None
 
 
@@ -199,18 +218,17 @@ class ResidualLearner(LeafSystem):
         )
         c = self._config.posterior
         if c is not None:
-            assert config.r_max and c.spacing and c.prior_std and c.drift  # _checked.
-            root = np.sqrt(period_sec)
-            self._grid = residual_grid(
-                config.r_max, c.spacing, c.prior_std, c.drift * root, c.growth * root
-            )
+            assert config.r_max and c.spacing and c.prior_std and c.walk.drift
+            root = np.sqrt(period_sec)  # They are given: _checked.
+            walk = c.walk.drift * root, c.walk.growth * root
+            self._grid = residual_grid(config.r_max, c.spacing, c.prior_std, *walk)
             _, std = mode_and_std(self._grid, self._grid.prior)
             memory = replace(
                 memory,
                 density=_frozen(np.tile(self._grid.prior, (n_groups, 1))),
                 std=_frozen(np.full(n_groups, std)),
                 idle=_frozen(np.zeros(n_groups)),
-                unexplained=_frozen(np.zeros(len(c.free_states))),
+                unexplained=_frozen(np.zeros(len(c.free.states))),
             )
         self._memory = self.DeclareAbstractState(Value(memory))
         ticket = {self.abstract_state_ticket(self._memory)}
@@ -267,7 +285,7 @@ class ResidualLearner(LeafSystem):
         if c.posterior is not None:
             unexplained = self._unexplained(memory, lcs, *pair)
             Q_d = Q_d.copy()
-            for i, square in zip(c.posterior.free_states, unexplained, strict=True):
+            for i, square in zip(c.posterior.free.states, unexplained, strict=True):
                 Q_d[i] = min(Q_d[i], 1.0 / max(square, 1e-300))
         with np.errstate(over="ignore", invalid="ignore"):  # Told by the status.
             step = measured_step(*pair, Q_d, c.eps, c.slip_noise)
@@ -275,7 +293,7 @@ class ResidualLearner(LeafSystem):
             return _held(memory, sample, LearnerStatus.NOT_FINITE)
         if c.posterior is not None:
             return self._with_posterior(memory, sample, step, unexplained)
-        buffer = memory.buffer.append(step, c.n_b)
+        buffer = memory.buffer.append(step, c.adam.n_b)
         residual, loss, status = self._learned(memory, buffer)
         return replace(
             memory, sample=sample, buffer=buffer, residual=residual, loss=loss,
@@ -308,7 +326,7 @@ class ResidualLearner(LeafSystem):
         for j, loss in enumerate(losses):
             density[j] = updated(
                 grid, density[j], loss, trust, c.posterior.loss_max,
-                idle[j] < c.posterior.hold_sec,
+                idle[j] < c.posterior.walk.hold_sec,
             )  # fmt: skip
             modes[j], std[j] = mode_and_std(grid, density[j])
         status = LearnerStatus.LEARNED if all(solved) else LearnerStatus.NOT_SOLVED
@@ -325,15 +343,15 @@ class ResidualLearner(LeafSystem):
         updated while no contact is possible [SI^2]."""
         c = self._config.posterior
         assert c is not None
-        if not len(c.free_states):
+        if not len(c.free.states):
             return memory.unexplained
         adapts = self._group >= 0
         least = (memory.residual.value - 2.0 * memory.std)[self._group[adapts]]
         for phi in (lcs.phi, lcs_next.phi):
             if phi is None or (phi[adapts] + least * lcs.dt <= 0.0).any():
                 return memory.unexplained
-        change = (lcs.A @ x + lcs.B @ u + lcs.d - x_next)[c.free_states]
-        share = min(lcs.dt / c.free_sec, 1.0)
+        change = (lcs.A @ x + lcs.B @ u + lcs.d - x_next)[c.free.states]
+        share = min(lcs.dt / c.free.average_sec, 1.0)
         after = (1.0 - share) * memory.unexplained + share * change**2
         return _frozen(after)
 
@@ -345,8 +363,8 @@ class ResidualLearner(LeafSystem):
             self._group,
             eps=c.eps,
             gamma=c.gamma,
-            learning_rate=c.learning_rate,
-            n_steps=c.n_steps,
+            learning_rate=c.adam.learning_rate,
+            n_steps=c.adam.n_steps,
             r_max=c.r_max,
         )
         if not solved:
@@ -413,17 +431,19 @@ def _checked(config: ResidualLearnerConfig, lcs: LCS, period_sec: float):
             raise ValueError(
                 f"Q_d is {c.Q_d}, expected {lcs.n_x} weights >= 0, not all 0"
             )
-    for name in ("eps", "learning_rate", "r_max"):
-        value = getattr(c, name)
+    for name in ("eps", "adam.learning_rate", "r_max"):
+        value = attrgetter(name)(c)
         if not (_is_number(value) and value > 0.0):
             raise ValueError(f"{name} is {value}, expected a positive number")
     if not c.slip_noise >= 0.0:
         raise ValueError(f"slip_noise is {c.slip_noise}, expected 0 or more")
     for name in ("n_b", "n_steps"):
-        value = getattr(c, name)
+        value = getattr(c.adam, name)
         if not (_is_number(value) and value >= 1 and value == int(value)):
-            raise ValueError(f"{name} is {value}, expected an integer of 1 or more")
-        setattr(c, name, int(value))
+            raise ValueError(
+                f"adam.{name} is {value}, expected an integer of 1 or more"
+            )
+        setattr(c.adam, name, int(value))
     bound = gamma_bound(lcs.F)
     if not bound > 0.0:
         raise ValueError(
@@ -466,47 +486,46 @@ def _with_defaults(config: ResidualLearnerConfig, dt: float) -> ResidualLearnerC
     """A copy in which every number is given."""
 
     def filled(part, **defaults):
-        return {k: v for k, v in defaults.items() if getattr(part, k) is None}
+        none = {k: v for k, v in defaults.items() if getattr(part, k) is None}
+        return replace(part, **none)
 
     posterior = config.posterior
     if posterior is not None:
         posterior = replace(
-            posterior,
-            free_states=list(posterior.free_states),
-            **filled(
-                posterior,
-                prior_std=GAP_STD / dt,
-                drift=GAP_DRIFT / dt,
-                spacing=GAP_SPACING / dt,
-            ),
+            filled(posterior, prior_std=GAP_STD / dt, spacing=GAP_SPACING / dt),
+            walk=filled(posterior.walk, drift=GAP_DRIFT / dt),
+            free=replace(posterior.free, states=list(posterior.free.states)),
         )
     return replace(
-        config,
-        Q_d=list(config.Q_d),
-        groups=[list(g) if np.iterable(g) else g for g in config.groups],
-        posterior=posterior,
-        **filled(
+        filled(
             config,
             eps=EPS_IMPULSE / dt,
             gamma=GAMMA_IMPULSE * dt,
-            learning_rate=GAP_RATE / dt,
             r_max=GAP_MAX / dt,
         ),
+        Q_d=list(config.Q_d),
+        adam=filled(config.adam, learning_rate=GAP_RATE / dt),
+        groups=[list(g) if np.iterable(g) else g for g in config.groups],
+        posterior=posterior,
     )
 
 
 def _check_posterior(c: PosteriorConfig, config: ResidualLearnerConfig, n_x: int):
     """Raises: ValueError that names a setting of the posterior out of range."""
-    for i in c.free_states:
+    for i in c.free.states:
         if i not in range(n_x):
-            raise ValueError(f"posterior.free_states names {i}, expected 0..{n_x - 1}")
-    for name, value in vars(c).items():
-        if name == "free_states" or (name == "misfit_sec" and value is None):
+            raise ValueError(f"posterior.free.states names {i}, expected 0..{n_x - 1}")
+    for name in (
+        "prior_std", "walk.drift", "walk.growth", "walk.hold_sec", "spacing", "trust",
+        "loss_max", "free.average_sec", "misfit_sec",
+    ):  # fmt: skip
+        value = attrgetter(name)(c)
+        if name == "misfit_sec" and value is None:
             continue
         least, what = np.nextafter(0.0, 1.0), "a positive number"
-        if name in ("growth", "hold_sec"):
+        if name in ("walk.growth", "walk.hold_sec"):
             least, what = 0.0, "0 or more"
-        finite = _is_number(value) or (name == "hold_sec" and value == np.inf)
+        finite = _is_number(value) or (name == "walk.hold_sec" and value == np.inf)
         if not (finite and least <= value):
             raise ValueError(f"posterior.{name} is {value}, expected {what}")
     assert config.r_max and c.spacing and c.prior_std  # _with_defaults.

@@ -1,6 +1,7 @@
 """Position and velocity of a ball from images (numerics/ball_tracker.py)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import Any
 
 import cv2
@@ -35,8 +36,22 @@ _PER_MODEL = 4 + 3 + 1
 
 
 @dataclass
+class BallMotionConfig:
+    """How the ball may move, in the filter: one model of motion, or two."""
+
+    # Spectral density of the white acceleration of a ball that rolls [m^2/s^3].
+    acceleration_density: float = 0.03
+    # The same of one that is driven (a push, a bump that it rolls off) [m^2/s^3]; 0:
+    # only one model.
+    driven_density: float = 0.0
+    # Mean time for which the ball rolls freely until it is driven [s].
+    free_sec: float = 1.0
+    driven_sec: float = 0.1  # Mean time for which the ball is driven [s].
+
+
+@dataclass
 class BallTrackerConfig:
-    """Settings of BallTracker: the ball, the colour, the noises of the filter."""
+    """Settings of BallTracker: the ball, its colour, its motion."""
 
     # Radius of the ball in the model [m]; the diagram sets it.
     ball_radius: float = 0.0315
@@ -44,14 +59,7 @@ class BallTrackerConfig:
     # Hue of the ball's colour [rad]: 0 red, 2.09 green, 4.19 blue; a fruit has its own.
     hue: float = 0.41
     position_std: float = 1e-3  # Standard deviation of one measured position [m].
-    # Spectral density of the white acceleration in the filter [m^2/s^3].
-    acceleration_density: float = 0.03
-    # Spectral density of the white acceleration in a second motion model, of a ball
-    # that is driven (a push, a bump that it rolls off) [m^2/s^3]; 0: only one model.
-    driven_density: float = 0.0
-    # Mean time for which the ball rolls freely until it is driven [s].
-    free_sec: float = 1.0
-    driven_sec: float = 0.1  # Mean time for which the ball is driven [s].
+    motion: BallMotionConfig = field(default_factory=BallMotionConfig)
     period_sec: float = 0.0125  # Period of the updates [s]; the diagram sets it.
     offset_sec: float = 0.0  # Time of the first update [s]; the diagram sets it.
 
@@ -90,18 +98,18 @@ class BallTracker(LeafSystem):
         for name in (
             "ball_radius",
             "position_std",
-            "acceleration_density",
-            "free_sec",
-            "driven_sec",
+            "motion.acceleration_density",
+            "motion.free_sec",
+            "motion.driven_sec",
             "period_sec",
         ):
-            if not 0.0 < getattr(config, name) < np.inf:
-                raise ValueError(
-                    f"{name} must be positive, got {getattr(config, name)}"
-                )
-        if not 0.0 <= config.driven_density < np.inf:
+            value = attrgetter(name)(config)
+            if not 0.0 < value < np.inf:
+                raise ValueError(f"{name} must be positive, got {value}")
+        motion = config.motion
+        if not 0.0 <= motion.driven_density < np.inf:
             raise ValueError(
-                f"driven_density is {config.driven_density}, expected 0 or more"
+                f"motion.driven_density is {motion.driven_density}, expected 0 or more"
             )
         if not np.isfinite(config.hue):
             raise ValueError(f"hue must be finite, got {config.hue}")
@@ -115,10 +123,10 @@ class BallTracker(LeafSystem):
         self._shape = (camera.height, camera.width, 4)
         self._image = self.DeclareAbstractInputPort("image", Value(ImageRgba8U()))
         self._radius_error = self.DeclareVectorInputPort("radius_error", 1)
-        densities, dwell = [config.acceleration_density], [config.free_sec]
-        if config.driven_density > 0.0:
-            densities.append(config.driven_density)
-            dwell.append(config.driven_sec)
+        densities, dwell = [motion.acceleration_density], [motion.free_sec]
+        if motion.driven_density > 0.0:
+            densities.append(motion.driven_density)
+            dwell.append(motion.driven_sec)
         self._densities = np.array(densities)
         self._chances = interacting_models.transition(dwell, config.period_sec)
         start: Any = np.zeros(_MODELS + _PER_MODEL * len(densities))

@@ -1,6 +1,7 @@
 """The pose of an object from a motion capture system: delayed, noisy, filtered."""
 
 from dataclasses import dataclass, field
+from operator import attrgetter
 
 import numpy as np
 from pydrake.common.value import AbstractValue, Value
@@ -22,28 +23,35 @@ from makebreak.systems.perception.numerics.pose_filter import (
 
 
 @dataclass
+class ObjectMotionConfig:
+    """How the object may move, in the filter; one that rolls, in two ways."""
+
+    # Spectral densities of the white acceleration: of the position [m2/s3], of the
+    # orientation [rad2/s3].
+    density: list[float] = field(default_factory=lambda: [0.02, 2.0])
+    # The same of the position of an object that rolls freely
+    # (numerics/interacting_models.py) [m2/s3].
+    free_density: float = 1e-5
+    # Mean time for which an object rolls freely until it is driven [s].
+    free_sec: float = 2.0
+    driven_sec: float = 0.3  # Mean time for which a rolling object is driven [s].
+
+
+@dataclass
 class PoseSensorConfig:
-    """Settings of PoseSensor: noise, delay, rate, and the noises of the filter."""
+    """Settings of PoseSensor: noise, delay, rate, and the object's motion."""
 
     # Standard deviations of the measured position [m] and orientation [rad], each axis.
     noise: list[float] = field(default_factory=lambda: [1e-3, 1e-2])
     # Delay of a reading from its measurement to its arrival [s].
     delay_sec: float = 1.0 / 30.0
     period_sec: float = 1.0 / 30.0  # Period of the readings [s].
-    # Spectral densities of the white acceleration in the filter: of the position
-    # [m2/s3], of the orientation [rad2/s3].
-    density: list[float] = field(default_factory=lambda: [0.02, 2.0])
+    motion: ObjectMotionConfig = field(default_factory=ObjectMotionConfig)
     # Height of the object's origin in the model [m]; the diagram sets it.
     height: float = 0.02
     # Axis in the object's frame about which it rolls; empty: it lies flat. The diagram
     # sets it.
     rolling_axis: list[float] = field(default_factory=list)
-    # Spectral density of the white acceleration in a second motion model, of an object
-    # that rolls freely (numerics/interacting_models.py) [m2/s3].
-    free_density: float = 1e-5
-    # Mean time for which an object rolls freely until it is driven [s].
-    free_sec: float = 2.0
-    driven_sec: float = 0.3  # Mean time for which a rolling object is driven [s].
     offset_sec: float = 0.0  # Time of the first reading [s]; the diagram sets it.
 
 
@@ -82,8 +90,8 @@ class PoseSensor(LeafSystem):
     def __init__(self, config: PoseSensorConfig, body: int, seed: int = 0):
         super().__init__()
         check_settings(config)
-        for name in ("noise", "density"):
-            values = getattr(config, name)
+        for name in ("noise", "motion.density"):
+            values = attrgetter(name)(config)
             if len(values) != 2 or not all(v >= 0.0 for v in values):
                 raise ValueError(
                     f"pose.{name} is {values}, expected two numbers of at least 0"
@@ -94,15 +102,15 @@ class PoseSensor(LeafSystem):
                 f"{config.period_sec}, expected at least 0 and more than 0"
             )
         self._config, self._body, self._seed = config, int(body), int(seed)
+        motion = config.motion
         for name in ("free_density", "free_sec", "driven_sec"):
-            if not 0.0 < getattr(config, name) < np.inf:
-                raise ValueError(
-                    f"pose.{name} is {getattr(config, name)}, expected > 0"
-                )
+            value = getattr(motion, name)
+            if not 0.0 < value < np.inf:
+                raise ValueError(f"pose.motion.{name} is {value}, expected > 0")
         self._axis = np.array(config.rolling_axis or [0.0, 0.0, 0.0], dtype=float)
-        self._densities = np.array([config.free_density, config.density[0]])
+        self._densities = np.array([motion.free_density, motion.density[0]])
         self._chances = interacting_models.transition(
-            [config.free_sec, config.driven_sec], config.period_sec
+            [motion.free_sec, motion.driven_sec], config.period_sec
         )
         zero = np.zeros(3)
         self._unknown = zero, zero, np.array([1.0, 0.0, 0.0, 0.0]), zero
@@ -145,7 +153,7 @@ class PoseSensor(LeafSystem):
             if pose is None:
                 pose = first_pose(at, p, q, std, (0.1, 1.0))
             else:
-                pose = corrected(predicted(pose, at, c.density), p, q, std)
+                pose = corrected(predicted(pose, at, c.motion.density), p, q, std)
             if c.rolling_axis:
                 rolling = self._corrected_rolling(rolling, p[:2], std[0])
                 (x, y), v, _ = interacting_models.combined(*rolling)

@@ -1,6 +1,7 @@
 """Pose and velocity of a flat object from images (numerics/pose_tracker.py)."""
 
 from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import Any
 
 import cv2
@@ -36,6 +37,15 @@ _READ, _READ_AT, _SIZE = slice(15, 18), 18, 19
 
 
 @dataclass
+class SlidingMotionConfig:
+    """How the object may move, in the filter."""
+
+    # Spectral density of the white acceleration of its position [m^2/s^3].
+    acceleration_density: float = 0.01
+    turning_density: float = 2.0  # The same of its yaw [rad^2/s^3].
+
+
+@dataclass
 class PoseTrackerConfig:
     """Settings of PoseTracker: the colour, the noises of the filter."""
 
@@ -46,11 +56,7 @@ class PoseTrackerConfig:
     # Standard deviation of one measured position, along x and y [m].
     position_std: float = 1e-3
     yaw_std: float = 0.01  # Standard deviation of one measured yaw [rad].
-    # Spectral density of the white acceleration in the position's filter [m^2/s^3].
-    acceleration_density: float = 0.01
-    # Spectral density of the white angular acceleration in the yaw's filter
-    # [rad^2/s^3].
-    turning_density: float = 2.0
+    motion: SlidingMotionConfig = field(default_factory=SlidingMotionConfig)
     # Axis in the object's frame about which it rolls; empty: it slides. The diagram
     # sets it.
     rolling_axis: list[float] = field(default_factory=list)
@@ -117,12 +123,13 @@ class PoseTracker(LeafSystem):
         for name in (
             "position_std",
             "yaw_std",
-            "acceleration_density",
-            "turning_density",
+            "motion.acceleration_density",
+            "motion.turning_density",
             "period_sec",
         ):
-            if not 0.0 < getattr(config, name) < np.inf:
-                raise ValueError(f"{name} is {getattr(config, name)}, expected above 0")
+            value = attrgetter(name)(config)
+            if not 0.0 < value < np.inf:
+                raise ValueError(f"{name} is {value}, expected above 0")
         if not np.isfinite(config.hue):
             raise ValueError(f"hue is {config.hue}, expected a number")
         top = config.z + float(shape.whole.points[:, 2].max())
@@ -187,10 +194,10 @@ class PoseTracker(LeafSystem):
         lost = state[_UNSEEN_SEC] > HOLD_SEC
         dt = c.period_sec
         ahead, _, P_next = constant_velocity.predict(
-            pose, rate, P, dt, c.acceleration_density
+            pose, rate, P, dt, c.motion.acceleration_density
         )
         _, _, P_yaw_next = constant_velocity.predict(
-            pose, rate, P_yaw, dt, c.turning_density
+            pose, rate, P_yaw, dt, c.motion.turning_density
         )
         image_in: Any = self._image.Eval(context)
         image = image_in.data

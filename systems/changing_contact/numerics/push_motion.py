@@ -11,7 +11,7 @@ Segments tell what is met: the ball in segment BALL_SEGMENT of the one, the tabl
 TABLE_SEGMENT of the other.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -29,6 +29,19 @@ N_FRAME = 7  # Origin (3) [m], its velocity (3) [m/s], when it was there [s].
 
 
 @dataclass
+class TableConfig:
+    """How the tip touches the table ahead of the ball."""
+
+    press: float = 2.5  # Force on it [N].
+    # Distance ahead of the ball's centre at which the tip lands [m].
+    land_ahead: float = 0.075
+    slide: float = 0.04  # Length of the sideways slide [m].
+    # Number of slides to and fro, into the circle, each from rest; 0: one slide out of
+    # the circle, as soon as the table is felt.
+    survey: int = 0
+
+
+@dataclass
 class PushConfig:
     """The shape of the motions."""
 
@@ -40,13 +53,7 @@ class PushConfig:
     # Distance behind the ball's centre at which the tip lands, seen from above [m].
     land_behind: float = 0.018
     press: float = 1.0  # Force on the ball from the touch until the push begins [N].
-    press_table: float = 2.5  # Force on the table while the tip touches it [N].
-    # Distance ahead of the ball's centre at which the tip lands on the table [m].
-    land_ahead: float = 0.075
-    slide: float = 0.04  # Length of the sideways slide on the table [m].
-    # Number of slides to and fro on the table, into the circle, each from rest; 0: one
-    # slide out of the circle, as soon as the table is felt.
-    survey: int = 0
+    table: TableConfig = field(default_factory=TableConfig)
 
 
 SLIDE_SPEED = 0.08  # [m/s]
@@ -132,37 +139,38 @@ def ball_pattern(config, start, heading, radius_ball, radius_tip, a_max):
 def table_pattern(config, start, heading, radius_ball, radius_tip, a_max):
     """Ahead of the ball and down on the table, then sideways. Args: as ball_pattern."""
     side = np.array([heading[1], -heading[0], 0.0])  # Out of a circle run to the left.
-    ahead = np.append(config.land_ahead * heading, 2.0 * radius_ball + radius_tip)
-    down = np.append(config.land_ahead * heading, radius_tip - BEYOND)
+    table = config.table
+    ahead = np.append(table.land_ahead * heading, 2.0 * radius_ball + radius_tip)
+    down = np.append(table.land_ahead * heading, radius_tip - BEYOND)
     hop = segment_time(float(np.linalg.norm(ahead - start)), HOP_SPEED, a_max)
     fall = segment_time(ahead[2] - down[2], HOP_SPEED, a_max, stops=False)
-    if config.survey > 0:
-        return _survey(config, [start, ahead, down], [hop, fall], -side, a_max)
-    slide = segment_time(config.slide, SLIDE_SPEED, a_max)
+    if table.survey > 0:
+        return _survey(table, [start, ahead, down], [hop, fall], -side, a_max)
+    slide = segment_time(table.slide, SLIDE_SPEED, a_max)
     return MotionPattern(
         (
             _segment("line", [start, ahead], 0.0, hop),
             _segment("line", [ahead, down], hop, fall),
             _segment(
-                "line", [down, down + config.slide * side], hop + fall, slide,
-                [config.press_table],
+                "line", [down, down + table.slide * side], hop + fall, slide,
+                [table.press],
             ),
         ),
         a_max,
     )  # fmt: skip
 
 
-def _survey(config, points, seconds, side, a_max):
+def _survey(table, points, seconds, side, a_max):
     """Down on the table, a rest there, and then to and fro along side (3,)."""
-    near, far = points[-1] + REST_WAY * side, points[-1] + config.slide * side
-    targets = [config.press_table]
+    near, far = points[-1] + REST_WAY * side, points[-1] + table.slide * side
+    targets = [table.press]
     segments, time = [], 0.0
     for k, duration in enumerate(seconds):
         segments.append(_segment("line", points[k : k + 2], time, duration))
         time += duration
     ways = [(points[-1], near, REST_SEC)]
-    duration = segment_time(config.slide - REST_WAY, SLIDE_SPEED, SURVEY_ACCELERATION)
-    for k in range(config.survey):
+    duration = segment_time(table.slide - REST_WAY, SLIDE_SPEED, SURVEY_ACCELERATION)
+    for k in range(table.survey):
         ways.append((near, far, duration) if k % 2 == 0 else (far, near, duration))
     for begin, end, duration in ways:
         segments.append(_segment("line", [begin, end], time, duration, targets))
