@@ -134,13 +134,6 @@ class CommandPorts:
             held = port.value.GetMutableData().get_mutable_value()
             held.SetFromVector(self._held(port, time))
 
-    def at(self, times: np.ndarray) -> list[tuple[str, str, np.ndarray]]:
-        """(model, what, (n, n_u)) of each port: what holds at the times (n,) [s]."""
-        return [
-            (port.model, port.what, self._held(port, times[:, None]))
-            for port in self._ports
-        ]
-
     def columns(self, times: np.ndarray) -> dict[str, np.ndarray]:
         """{channel: (n,)} what holds at the times (n,) [s]."""
         return {

@@ -253,10 +253,10 @@ class DrivenArmSimulation(SceneSimulation):
         events = events[(events > start + SAME_SEC) & (events < needed[-1])]
         times = np.union1d(np.append(needed, start), events)
         told = np.zeros((len(times) - 1, 2, n))
-        for model, what, values in self._commands.at(times[:-1]):
-            row = 1 if what == "velocity_command" else 0
-            for k, actuator in enumerate(actuators_of_model(plant, model)):
-                told[:, row, actuator.joint().velocity_start()] = values[:, k]
+        index = {full_name(plant, j): j.velocity_start() for j in one_dof_joints(plant)}
+        for channel, values in self._commands.columns(times[:-1]).items():
+            joint, _, what = channel.rpartition(".")
+            told[:, int(what == "velocity_command"), index[joint]] = values
         told[:, 0] = self.arms.received(told[:, 0])
         y = np.empty((len(times), 2 * n))
         y[0] = x
