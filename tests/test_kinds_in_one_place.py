@@ -26,7 +26,6 @@ KNOWN = {
         "contact_friction", "object_com", "object_mass", "object_size"
     },
     "diagrams/realism.py": {"joint_offset", "plane_height", "plane_tilt"},
-    "diagrams/station.py": {"joint_viscous_damping"},
     "diagrams/tabletop.py": {"contact_friction", "contact_stiffness"},
     "gap/simulation/free_body.py": CONTACT
     | {"body_drag", "body_quadratic_drag", "clock_skew", "gravity_tilt", "sensor_bias",
@@ -34,12 +33,12 @@ KNOWN = {
     "gap/data/check_relations.py": {"clock_skew"},
     "gap/residuals/contact.py": CONTACT,
     "gap/residuals/contact_dynamics.py": {
-        "actuator_bias", "actuator_gain", "input_delay", "object_com", "sensor_bias",
+        "actuator_bias", "actuator_gain", "input_delay", "object_com",
         "object_inertia", "object_mass", "object_size",
     },
     "gap/residuals/permitted_contacts.py": {
         "contact_friction", "friction_patch", "object_size", "plane_height",
-        "plane_tilt", "wall_position",
+        "plane_tilt",
     },
     "gap/residuals/felt_places.py": {"plane_height", "plane_tilt", "wall_position"},
     "gap/residuals/pressing.py": {
@@ -57,8 +56,7 @@ KNOWN = {
     "gap/simulation/free_windows.py": {"length_scale"},
     "gap/simulation/windows.py": {"length_scale"},
     "gap/residuals/touch.py": {
-        "contact_stiffness", "joint_offset", "length_scale", "object_size",
-        "plane_height", "sensor_bias",
+        "joint_offset", "length_scale", "object_size", "plane_height", "sensor_bias",
     },
 }  # fmt: skip
 FILES = sorted(
