@@ -90,12 +90,10 @@ from makebreak.gap.said import MANY_ALIKE, figure
 from makebreak.gap.search.choice import Choice, Selection
 from makebreak.gap.search.chosen_by_simulation import (
     above_step,
-    kept_by_simulation,
-    preferred_by_simulation,
+    chosen_by_simulation,
 )
 from makebreak.gap.search.drop import with_errors
 from makebreak.gap.search.select import select, without
-from makebreak.gap.search.softer_by_simulation import softer_by_simulation
 from makebreak.gap.search.trust import drift_sentences, scatter, trust_in
 from makebreak.gap.simulation.measure import WINDOW_SEC
 from makebreak.gap.simulation.scene_simulation import SceneSimulation
@@ -643,9 +641,7 @@ def conclude(
     and take a verdict back; they choose none.
     """
     selection = _beyond_laws(problem, selection)
-    selection, chosen_on = kept_by_simulation(problem, selection, jobs)
-    selection, chosen_on = preferred_by_simulation(problem, selection, chosen_on, jobs)
-    selection, chosen_on = softer_by_simulation(problem, selection, chosen_on, jobs)
+    selection, chosen_on = chosen_by_simulation(problem, selection, jobs)
     step = max((c.size for c in checks if c.kind == "time_step"), default=0.0)
     selection, chosen_on, vetoed, below = above_step(
         problem, selection, chosen_on, step, jobs

@@ -369,14 +369,15 @@ def test_simulation_decides_between_what_equations_find_alike(
 
     def outcome(effects, *_, **__):
         asked.append(effects[0].kind)
-        return Outcome(GapMeasure(60.0, friction, 1.0, 0.6))
+        left = mass if effects[0].kind == "object_mass" else friction
+        return Outcome(GapMeasure(60.0, left, 1.0, 0.6))
 
     def fit(problem, screen, start, *_):
         return SimpleNamespace(effects=tuple(start), std=({},), score=1.1)
 
     monkeypatch.setattr(chosen_by_simulation, "fit_effects", fit)
     problem = SimpleNamespace(
-        plan=SearchPlan(simulation_agrees=True), outcome=outcome
+        plan=SearchPlan(simulation_agrees=True), outcome=outcome, softer=list
     )  # fmt: skip
     choice = Choice(chosen, {}, 5.0, 1.0, "", 0.0, (), (), 1)
     nothing = SimpleNamespace()
@@ -384,16 +385,13 @@ def test_simulation_decides_between_what_equations_find_alike(
         (choice,), nothing, nothing, nothing, (first, rival, worse)
     )  # fmt: skip
     monkeypatch.setattr(Selection, "screen", lambda self, problem: None)
-    before = Outcome(GapMeasure(60.0, mass, 1.0, 0.6))
-    got, after = chosen_by_simulation.preferred_by_simulation(
-        problem, selection, before, 1
-    )
+    got, after = chosen_by_simulation.chosen_by_simulation(problem, selection, 1)
     taken = got.choices[0].effect.kind
     if mass > 1.5 and friction < 0.8 * mass:
         assert (taken, after.gap.after) == ("contact_friction", friction)
     else:
         assert (taken, after.gap.after) == ("object_mass", mass)
-    assert asked == (["contact_friction"] if mass > 1.5 else [])
+    assert asked[1:] == (["contact_friction"] if mass > 1.5 else [])
 
 
 @pytest.mark.slow

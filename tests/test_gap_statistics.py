@@ -50,7 +50,7 @@ from makebreak.gap.search.choice import (
     deviations_off,
     is_significant,
 )
-from makebreak.gap.search.chosen_by_simulation import kept_by_simulation
+from makebreak.gap.search.chosen_by_simulation import chosen_by_simulation
 from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.search.drop import _is_certain
 from makebreak.gap.search.screen import Ranked
@@ -1414,7 +1414,7 @@ def test_a_gap_in_a_gear_that_windows_do_not_show_is_dropped(both, one, kept):
         for e, f in zip(end.effects, fixed, strict=True)
     )
     selection = Selection(choices, start, end, nuisances)
-    left, outcome = kept_by_simulation(problem, selection, 1)
+    left, outcome = chosen_by_simulation(problem, selection, 1)
     assert len(left.choices) == kept and outcome.gap.after == min(both, one)
     assert left.choices[0].effect.kind == "joint_viscous_damping"
     # What stays is fitted again without it: of 18,000 rows to 1 %.
@@ -1423,7 +1423,7 @@ def test_a_gap_in_a_gear_that_windows_do_not_show_is_dropped(both, one, kept):
     assert (left.end is end) == (kept == 2)
     # Alone it is judged as any other.
     alone = replace(selection, choices=choices[1:])
-    assert kept_by_simulation(problem, alone, 1)[0] is alone
+    assert chosen_by_simulation(problem, alone, 1)[0] is alone
 
 
 def test_a_fit_goes_beyond_what_is_searched_but_for_what_ends():
