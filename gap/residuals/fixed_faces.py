@@ -6,7 +6,6 @@ pressed it back, is how far it is off. What stands on another body moves with th
 
 from collections.abc import Collection
 from dataclasses import dataclass, replace
-from itertools import product
 
 import numpy as np
 from pydrake.multibody.tree import BodyIndex
@@ -16,6 +15,7 @@ from makebreak.gap.residuals.contact_problem import ContactProblem
 from makebreak.gap.residuals.touching import MEETS
 from makebreak.gap.residuals.wrench_sensor import FORCE
 from makebreak.gap.simulation.contact_shapes import Slot
+from makebreak.gap.simulation.free_body import gone_on
 
 REACH = 0.12  # What is fixed is no farther off than this [m].
 KNOCKED = 8e-3  # A knock goes no deeper than this [m].
@@ -150,43 +150,26 @@ class FixedFaces(ContactProblem):
         return on
 
     def _sink_what_stands(self, poses) -> None:
-        """A box whose whole bottom is on another box, or a half-space, goes on into
-        that. Its lower edge would push down a tool that is a little too deep in what it
-        stands on, and a place that is wrong by so much would explain forces by that."""
-        stands = {k for own in self._carried.values() for k in own}
-        for number, s in enumerate(self.shapes.surfaces):
-            if s.kind != "box" or s.body not in stands:
-                continue
-            R_b, p_b = poses[s.body][0][0], poses[s.body][1][0]
-            R = R_b @ s.R_BG
-            axis = int(np.argmax(np.abs(R[2])))
-            down = -np.sign(R[2, axis])
-            (half,) = s.size
-            corners = np.array(list(product((-1.0, 1.0), repeat=3))) * half
-            bottom = corners[corners[:, axis] * down > 0.0]
-            places = p_b + (s.p_BG + bottom @ s.R_BG.T) @ R_b.T
-            below = self._thickness_below(places, s.body, poses)
-            if abs(R[2, axis]) > LEVEL and below:
-                longer = np.eye(3)[axis] * 0.5 * below
-                self.shapes.surfaces[number] = replace(
-                    s, size=(half + longer,), p_BG=s.p_BG + s.R_BG @ (down * longer)
-                )
-
-    def _thickness_below(self, places, body: int, poses) -> float:
-        """How thick the box or half-space is on which all places (n, 3) of a body are,
-        REACH at most [m]; 0 where they are on none."""
-        for s in self.shapes.surfaces:
-            is_flat = s.kind in ("box", "half_space")
-            if not is_flat or body not in self._carried.get(s.body, ()):
-                continue
+        """A box that stands on another one, or on a half-space, goes on into that. Its
+        lower edge would push down a tool that is a little too deep in what it stands
+        on, and a place that is wrong by so much would explain forces by that."""
+        flat = [
+            k for k, s in enumerate(self.shapes.surfaces)
+            if s.body in self._carried and s.kind in ("box", "half_space")
+        ]  # fmt: skip
+        fixed = []
+        for k in flat:
+            s = self.shapes.surfaces[k]
             R, p = poses[s.body][0][0], poses[s.body][1][0]
-            d, _ = s.distance((places - p) @ R)
-            if (np.abs(d) < STANDS).all():
-                if s.kind == "half_space":
-                    return REACH
-                thick = 2.0 * np.abs((R @ s.R_BG)[2]) @ s.size[0]
-                return min(float(thick), REACH)
-        return 0.0
+            half = s.size[0] if s.kind == "box" else (-1.0, 0.0, 0.0)
+            fixed.append([*(R @ s.R_BG).ravel(), *(p + R @ s.p_BG), *half])
+        for k, longer in zip(flat, gone_on(np.reshape(fixed, (-1, 15))), strict=True):
+            s = self.shapes.surfaces[k]
+            R, p = poses[s.body][0][0], poses[s.body][1][0]
+            if s.kind == "box":
+                self.shapes.surfaces[k] = replace(
+                    s, size=(longer[12:],), p_BG=R.T @ (longer[9:12] - p)
+                )
 
     def _possible_faces(self, poses) -> list[Face]:
         """Faces of fixed boxes over which the tool came, with how near it kept to them:
