@@ -18,7 +18,6 @@ from makebreak.gap.numerics.free_body import FreeBody, simulate
 from makebreak.gap.residuals.contact_dynamics import ContactDynamics
 from makebreak.gap.residuals.contact_problem import ContactProblem
 from makebreak.gap.residuals.pressing import PressingProblem
-from makebreak.gap.residuals.touching import BESIDE, MEETS
 from makebreak.gap.result import GapMeasure
 from makebreak.gap.search.choice import Choice
 from makebreak.gap.search.comparison import Comparison
@@ -210,10 +209,9 @@ def test_a_hole_that_stands_elsewhere_was_passed_through_the_walls_that_are_open
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed, y", [(15, 6.89e-3), (20, -5.11e-3)])
-def test_a_wall_stands_where_what_is_pushed_meets_it(tmp_path, seed, y):
-    """Farther away it was gone through; nearer nothing touches it in the scene."""
-    problem = problem_of(tmp_path, ContactProblem, "corner", seed, most=1, hide="wall")
+def test_a_wall_stands_where_what_is_pushed_meets_it(tmp_path):
+    """Farther away than in the scene, where it was gone through."""
+    problem = problem_of(tmp_path, ContactProblem, "corner", 15, most=1, hide="wall")
     search = Comparison(problem, lambda text: None)
     start = fit_effects(problem, search.screen(problem.base()), ())
     [wall] = [
@@ -222,27 +220,8 @@ def test_a_wall_stands_where_what_is_pushed_meets_it(tmp_path, seed, y):
     ]  # fmt: skip
     [ranked] = rank(search.screen(start.r), [wall])
     fit = fit_effects(problem, search.screen(start.r), ranked.effects)
-    assert fit.effects[0].parameters == pytest.approx({"y": y}, abs=5e-4)
+    assert fit.effects[0].parameters == pytest.approx({"y": 6.89e-3}, abs=5e-4)
     assert fit.score < 0.7 * start.score
-
-
-@pytest.mark.slow
-def test_a_body_that_stops_in_front_of_a_wall_touches_it_only_if_that_is_felt(
-    tmp_path, monkeypatch
-):
-    """Of the same motion, with forces that need no wall."""
-    felt = problem_of(tmp_path, ContactProblem, "corner", 20, most=1, hide="wall")
-    [(pair, off)] = felt._met_at.items()
-    # What is left everywhere alike is no wall's force.
-    phi = felt._least_distances()[(*pair, BESIDE)]
-    alike = np.ones(len(felt.means.time))
-    there = felt._wholly((phi < off + MEETS)[felt._rows])
-    assert not felt._may_be_felt(alike, phi, off)
-    assert felt._may_be_felt(alike + 9.0 * there, phi, off)
-    monkeypatch.setattr(
-        ContactProblem, "_mean_squares", lambda self, *a: np.ones(len(self.means.time))
-    )
-    assert not type(felt)(felt.scene, felt.recordings)._met_at
 
 
 # ----- Meshes

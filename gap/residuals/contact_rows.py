@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from makebreak.gap.residuals.felt_walls import FeltWalls
+from makebreak.gap.residuals.contact_dynamics import ContactDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 
@@ -15,7 +15,7 @@ BLOCK_SEC = 0.6  # In which a tool goes a few centimetres.
 ONE_BLOCK = 0.5  # Of the squares that are left: more, and it is most of them.
 
 
-class ContactRows(FeltWalls):
+class ContactRows(ContactDynamics):
     """Rows (m,) out of the table (K, n) of ContactDynamics.left()."""
 
     # Which of the table are rows (K, n); which test functions are fitted, and the block

@@ -11,7 +11,6 @@ import numpy as np
 
 from makebreak.gap.numerics.permitted_forces import explain
 from makebreak.gap.residuals.contact_dynamics import SHAPED
-from makebreak.gap.residuals.felt_walls import FEWEST_SEEN, LESS
 from makebreak.gap.residuals.fixed_faces import (
     CLEAR,
     LEAST_FORCE,
@@ -28,7 +27,9 @@ from makebreak.gap.simulation.contact_shapes import MEETS, Slot
 from makebreak.models.effects.kind import Effect
 
 STILL_DEEP = 0.1  # Of the nodes at which it was: knocks go deeper, too.
-FELT = 4.0  # Mean square of what is left where a face is felt.
+FELT = 4.0  # Mean square of what is left where a face is felt,
+LESS = 0.5  # and what that face may leave of it.
+FEWEST_SEEN = 3  # Test functions in which a face is pressed on.
 MOVES = ("wall_position", "plane_height")
 WHOLE = 0.9  # Of the squares left: one more place or friction must leave less.
 MOST_SLOTS = 12  # Places of a fixed body at which its distances are kept.
@@ -401,6 +402,21 @@ class FeltPlaces(FixedFaces):
         """A pressing force of less may be nothing [N]."""
         var = [np.median(self.means.wrench_var[:, s.forces]) for s in self.sensors]
         return max([LEAST_FORCE, *(CLEAR * float(np.sqrt(x)) for x in var)])
+
+    def _wholly(self, on: np.ndarray) -> np.ndarray:
+        """(K,) test functions all of whose nodes are among (n_nodes,) these."""
+        return np.asarray(self._W @ on.astype(float)).ravel() > 0.999
+
+    def _mean_squares(self, displaced: Sequence[Effect]) -> np.ndarray:
+        """(K,) of what equations and wrenches leave with bodies displaced."""
+        needs = self._all_needs(())
+        G, there, _, _, sharing = self._generators(displaced)
+        left = np.zeros_like(needs)
+        explain(
+            needs, G, there, self.root, sharing, left,
+            np.zeros((len(left), there.shape[1])), np.zeros(len(left), np.int64),
+        )  # fmt: skip
+        return np.mean(left**2, axis=1)
 
     def _inside(self, placed: Sequence[Effect]) -> dict[int, np.ndarray]:
         """{fixed body: (n_nodes,) distance of the tool from it}, where it is near."""

@@ -268,7 +268,7 @@ class PermittedContacts(ContactMeans):
             if touching is not None:
                 may &= touching[self._rows][:, None]
             else:
-                may &= nearest[:, None] < MEETS + self._met_at.get(pair, 0.0)
+                may &= nearest[:, None] < MEETS
             for column, k in enumerate(index):
                 out[k] = may[:, column]
         return out

@@ -39,8 +39,6 @@ class Touching(SceneMotion):
         # {bodies: how far apart (n_rows,) [m]} of contacts that a sensor feels.
         self._apart: dict[tuple[int, ...], np.ndarray] = {}
         self.biased: dict[str, float] = {}
-        # {bodies: where they meet, by what is felt, if not at 0 [m]}.
-        self._met_at: dict[tuple[int, int], float] = {}
         # {bodies: (n_rows,) whether they meet or part just then}, of what moves.
         self._lands: dict[tuple[int, ...], np.ndarray] = {}
         self._touching = self._touching_rows()
