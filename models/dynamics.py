@@ -7,7 +7,7 @@ actuation path (the effort is what acts on the joints), and effects with hidden 
 which no channel measures (elasticity, backlash).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,6 +24,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from makebreak.models.drives import law_of
 from makebreak.models.effects import KINDS
+from makebreak.models.effects.contact import FRICTION
 from makebreak.models.effects.kind import (
     Effect,
     find_body,
@@ -61,7 +62,11 @@ class SceneDynamics:
     """Residuals of a scene's model, and signatures of effects in them.
 
     It owns one Context, so it must be used by one thread only.
+
+    friction_of: of a pair, where another simulator mixes its surfaces; None: as Drake.
     """
+
+    friction_of: Callable[[str], float | None] = staticmethod(lambda pair: None)
 
     def __init__(self, scene: Scene | str | Path):
         if not isinstance(scene, Scene):
@@ -317,6 +322,11 @@ class SceneDynamics:
                     value = effect.parameters[name]
             return {name: value}
         if entry.now is not None:
+            if entry.at == "pair":  # Several are alike.
+                at = at[:1]
+                mu = self.friction_of(at[0]) if kind == FRICTION else None
+                if mu is not None:
+                    return {"friction": mu}
             effect = Effect(kind, list(at), {})
             return dict(entry.now(effect, self.plant, self.loaded.scene_graph))
         return {

@@ -254,20 +254,22 @@ class MujocoTwin:
 
     def _set_pairs(self, spec, effects: Sequence[Effect]) -> None:
         """What effects say of a pair's friction; all else is as MuJoCo mixes it."""
-        of: dict[str, list[int]] = {}
         m, writer = self._writer.m, self._writer
-        for g in np.flatnonzero(m.geom_contype | m.geom_conaffinity):
-            of.setdefault(writer.body_of(int(g)), []).append(int(g))
         pairs: dict[tuple[int, int], float] = {}
         for e in effects:  # The last one counts.
             for at in e.at if e.kind == FRICTION else ():
-                a, b = (name.partition(".")[2] for name in at.split("~"))
-                for pair in product(of.get(a, ()), of.get(b, ())):
-                    one, other = sorted(pair)
-                    pairs[one, other] = e.parameters["friction"]
+                pairs |= dict.fromkeys(self._geoms_of(at), e.parameters["friction"])
         for (one, other), friction in pairs.items():
-            if _collide(m, one, other):
-                _add_pair(spec, m, writer, one, other, friction)
+            _add_pair(spec, m, writer, one, other, friction)
+
+    def _geoms_of(self, pair: str) -> list[tuple[int, int]]:
+        """The geoms with which two bodies may touch."""
+        m, of = self._writer.m, dict[str, list[int]]()
+        for g in np.flatnonzero(m.geom_contype | m.geom_conaffinity):
+            of.setdefault(self._writer.body_of(int(g)), []).append(int(g))
+        a, b = (name.partition(".")[2] for name in pair.split("~"))
+        both = (sorted(two) for two in product(of.get(a, ()), of.get(b, ())))
+        return [(one, other) for one, other in both if _collide(m, one, other)]
 
     def _set_drives(self, spec, loaded: LoadedScene, effects: Sequence[Effect]):
         act, plant = loaded.scene.actuation, loaded.plant
@@ -425,14 +427,10 @@ def _collide(m, one: int, other: int) -> bool:
 
 def _add_pair(spec, m, writer, one: int, other: int, friction: float) -> None:
     names = [writer.name_of("geom", g) for g in (one, other)]
-    first = int(np.argmax([m.geom_priority[one], m.geom_priority[other]]))
-    if m.geom_priority[one] != m.geom_priority[other]:
-        share = np.array([1.0 - first, float(first)])
-    else:
-        share = np.array([m.geom_solmix[one], m.geom_solmix[other]])
-        share = share / share.sum() if share.sum() > 0.0 else np.full(2, 0.5)
     both = [one, other]
-    counts = share > 0.0 if 0.0 in share else np.ones(2, bool)
+    counts = m.geom_priority[both] == m.geom_priority[both].max()
+    share = np.where(counts, m.geom_solmix[both], 0.0)
+    share = share / share.sum() if share.sum() > 0.0 else counts / counts.sum()
     every = m.geom_friction[both][counts].max(axis=0)
     refs = m.geom_solref[both]
     solref = share @ refs if (refs[:, 0] > 0.0).all() else refs.min(axis=0)

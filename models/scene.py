@@ -329,7 +329,8 @@ def load_scene(
     for effect in effects:
         before = KINDS[effect.kind].before_finalize
         if before is not None:
-            before(effect, plant, scene_graph)
+            for one in _of_each_pair(effect):
+                before(one, plant, scene_graph)
     if before_finalize is not None:
         before_finalize(plant, scene_graph)
     try:
@@ -374,7 +375,8 @@ def load_scene(
     for effect in effects:
         after = KINDS[effect.kind].after_finalize
         if after is not None:
-            forces.append(after(effect, plant, scene_graph, builder))
+            for one in _of_each_pair(effect):
+                forces.append(after(one, plant, scene_graph, builder))
         if KINDS[effect.kind].hidden_state:
             couplings.append(builder.GetSubsystemByName(coupling_name(effect)))
     if forces:
@@ -398,6 +400,13 @@ def load_scene(
         body_forces,
         tuple(couplings),
     )
+
+
+def _of_each_pair(effect: Effect) -> list[Effect]:
+    """An effect at several pairs, which are alike in it, as one at each."""
+    if KINDS[effect.kind].at != "pair":
+        return [effect]
+    return [Effect(effect.kind, [at], effect.parameters) for at in effect.at]
 
 
 def _joint_numbers(plant: MultibodyPlant, effects: Sequence[Effect]) -> list:

@@ -561,3 +561,8 @@ def test_friction_of_an_object_with_rougher_feet_is_that_of_what_meets(tmp_path)
         assert now["friction"] == pytest.approx(new)
         kept = dynamics.now("contact_friction", [pairs[other]])
         assert changed.now("contact_friction", [pairs[other]]) == pytest.approx(kept)
+    alike = Effect("contact_friction", [*pairs.values()], {"friction": 0.25})
+    changed = SceneDynamics(replace(scene, effects=[alike]))
+    for at in pairs.values():
+        now = changed.now("contact_friction", [at])["friction"]
+        assert now == pytest.approx(0.25)

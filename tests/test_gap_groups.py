@@ -62,6 +62,27 @@ def test_columns_of_a_gain_hold_however_far_it_is_off(tmp_path):
         )
 
 
+def test_pairs_of_one_surface_may_have_one_friction():
+    """The box is on the floor and at the rod, alike; a second box's friction differs,
+    and what the floor has with both is not alike."""
+    now = {"box~floor": 0.4, "box~rod": 0.4, "can~floor": 0.7}
+    X = np.eye(3)
+    pairs = [
+        Candidate(
+            "contact_friction", ("~".join(f"w.{b}" for b in at.split("~")),), 1,
+            (X[:, [k]],), (lambda c, mu=mu: {"friction": mu + c[0]},),
+        )
+        for k, (at, mu) in enumerate(now.items())
+    ]  # fmt: skip
+    each, shared = groups_of(pairs)
+    assert len(each.members) == 3 and not shared.members
+    assert (shared.at, shared.size) == (("w.box~w.floor", "w.box~w.rod"), 1)
+    np.testing.assert_array_equal(shared.columns[0], X[:, [0]] + X[:, [1]])
+    (effect,) = shared.effects(0, np.array([0.2]))
+    assert effect.parameters == {"friction": pytest.approx(0.6)}
+    assert effect.at == list(shared.at)
+
+
 KINDS = ("joint_coulomb_friction", "joint_viscous_damping", "rotor_inertia")
 NAMES = ("coulomb", "damping", "inertia")
 

@@ -946,6 +946,7 @@ def _picked(trials, correlation=1.0, cost=None):
     m = len(next(iter(trials.values()))[1])
     train = np.arange(m) // 30 % 3 != 1
     search = SimpleNamespace(
+        plan=SearchPlan(),
         problem=SimpleNamespace(weighed_by=lambda _: None, correlation=correlation),
         train=train, error=lambda score: score, start=SimpleNamespace(score=1.0),
         nuisances=SimpleNamespace(prior=np.array([0.1])),

@@ -5,7 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from makebreak.gap.problem import SearchPlan
 from makebreak.gap.residuals.impacts import candidates_of
+from makebreak.gap.residuals.in_mujoco import _by_parabola
+from makebreak.gap.search.trials import pick_simplest
 
 
 def test_a_trial_takes_off_what_it_explains():
@@ -25,3 +28,38 @@ def test_a_trial_takes_off_what_it_explains():
     np.testing.assert_allclose(current.r - 3.0 * column[:, 0], 0.0, atol=1e-12)
     (effect,) = found.effects(0, np.array([1.0]))
     assert effect.parameters["damping"] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("evidence", "expected"),
+    # The third has one parameter less than the second; the first is held out best.
+    [((0.0, 100.0, 80.0), 1), ((0.0, 100.0, 95.0), 2), ((50.0, 20.0, 45.0), 2)],
+)
+def test_evidence_picks_where_it_counts(evidence, expected):
+    trials = [
+        SimpleNamespace(
+            fit=SimpleNamespace(score=score, says=e),
+            ranked=SimpleNamespace(
+                candidate=SimpleNamespace(size=n, fixed=(), at=("a.b",), members=())
+            ),
+        )
+        for score, e, n in zip((1.0, 2.0, 3.0), evidence, (2, 2, 1), strict=True)
+    ]
+    search = SimpleNamespace(
+        plan=SearchPlan(counts_evidence=True),
+        evidence=lambda one, other, more: one.says - other.says,
+    )
+    assert pick_simplest(search, trials, (), 4.0) == expected  # type: ignore[arg-type]
+
+
+def test_a_parabola_says_how_far_a_parameter_may_be_off():
+    """By one in the sum of squares about its bottom, and by where that is; more where
+    the sum is rough; no bottom, no deviation."""
+    steps = 0.1 * np.arange(-4.0, 5.0)
+    at_bottom = _by_parabola(steps, 7.0 + (steps / 0.2) ** 2, 1.0)
+    assert at_bottom == pytest.approx(0.2)
+    aside = _by_parabola(steps, ((steps - 0.15) / 0.2) ** 2, 1.0)
+    assert aside == pytest.approx(0.25)
+    rough = 8.0 * np.cos(np.pi * np.arange(9))
+    assert _by_parabola(steps, (steps / 0.2) ** 2 + rough, 1.0) > 2.0 * at_bottom
+    assert _by_parabola(steps, -(steps**2), 1.0) == np.inf

@@ -51,7 +51,7 @@ def own(**changes) -> np.ndarray:
     return np.array(rows)
 
 
-def simulated(folder, *effects: Effect, noted: set | None = None) -> np.ndarray:
+def simulated(folder, *effects: Effect, noted: dict | None = None) -> np.ndarray:
     """The same by a scene. noted: the pairs that touch are added to it."""
     (folder / "w.xml").write_text(FILE.format(**PLAIN))
     (folder / "scene.yaml").write_text(
@@ -99,6 +99,17 @@ def simulated(folder, *effects: Effect, noted: set | None = None) -> np.ndarray:
         # The larger of two shapes' friction counts, so a tip's is the pair's.
         ({"tip": 0.8}, [("contact_friction", "w.box~w.pusher", {"friction": 0.8})]),
         ({"floor": 0.6}, [("contact_friction", "w.box~w.floor", {"friction": 0.6})]),
+        # One value of two pairs.
+        (
+            {"floor": 0.55, "tip": 0.55},
+            [
+                (
+                    "contact_friction",
+                    "w.box~w.floor w.box~w.pusher",
+                    {"friction": 0.55},
+                ),
+            ],
+        ),
         # Of a link whose file gives moments of inertia.
         (
             {"arm": 0.8},
@@ -108,7 +119,7 @@ def simulated(folder, *effects: Effect, noted: set | None = None) -> np.ndarray:
     ],
 )
 def test_effects_are_what_the_same_change_of_the_file_is(tmp_path, changes, effects):
-    each = [Effect(kind, [at], parameters) for kind, at, parameters in effects]
+    each = [Effect(kind, at.split(), parameters) for kind, at, parameters in effects]
     expected = own(**changes)
     if changes:
         assert np.abs(expected - own()).max() > 1e-3  # It shows.
@@ -124,18 +135,20 @@ def test_pairs_that_touch_are_those_of_mujoco(tmp_path, wall, monkeypatch):
     monkeypatch.setitem(PLAIN, "wall", wall)
     model = mujoco.MjModel.from_xml_string(FILE.format(**PLAIN))
     data = mujoco.MjData(model)
-    expected, names = set(), ["floor", "a_wall", "pusher", "box"]
+    expected, names = {}, ["floor", "a_wall", "pusher", "box"]
     for qpos in own():
         data.qpos[:] = qpos
         mujoco.mj_kinematics(model, data)
         mujoco.mj_collision(model, data)
         expected |= {
-            "~".join(f"w.{names[g]}" for g in sorted((c.geom1, c.geom2), reverse=True))
+            "~".join(
+                f"w.{names[g]}" for g in sorted((c.geom1, c.geom2), reverse=True)
+            ): pytest.approx(c.friction[0])
             for c in data.contact
         }
-    simulated(tmp_path, noted=(noted := set()))
+    simulated(tmp_path, noted=(noted := {}))
     order = {"w.box~w.pusher": "w.box~w.pusher", "w.pusher~w.box": "w.box~w.pusher"}
-    assert {order.get(at, at) for at in noted} == expected
+    assert {order.get(at, at): mu for at, mu in noted.items()} == expected
     assert ("w.box~w.a_wall" in noted) == (wall == 0.4)
 
 

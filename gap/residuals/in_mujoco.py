@@ -43,8 +43,11 @@ LATE, LESS = (-1.25, -1.0, -0.75, -0.5, -0.25, 0.0), 0.97
 # In which a calm start is looked for, if so much of a window is left.
 CALM_SEC, LEAST = 0.3, 0.65
 PART_SEC = 0.1  # Of a window, where parts are held out.
-# Of how far a parameter is from the scene: where the sum of squares is asked.
-ASIDE = (-0.4, -0.2, -0.1, -0.05, 0.0, 0.05, 0.1, 0.2, 0.4)
+# Relative: where contacts chatter slopes over smaller steps say what chance does.
+DIFF_STEP = 0.1
+# Of how far a parameter is from the scene: where the sum of squares is asked; and how
+# many times as far where that is too near to tell.
+ASIDE, FARTHER = (-0.4, -0.2, -0.1, -0.05, 0.0, 0.05, 0.1, 0.2, 0.4), (1.0, 2.5)
 UNEVEN = 0.5  # What is held out must have so much of the error.
 BLUR = 5e-4  # Of how far a channel goes: where steps fall between rows is not known.
 
@@ -56,7 +59,7 @@ class MujocoProblem(WindowModel, WindowedProblem):
     """
 
     plan = SearchPlan(
-        evaluations=8, diff_step=5e-3, least_gain=0.05, most_effects=MOST_EFFECTS,
+        evaluations=8, diff_step=DIFF_STEP, least_gain=0.05, most_effects=MOST_EFFECTS,
         jumps=True, alike=True, loud=UNEXPLAINED_RMS, counts_evidence=True,
     )  # fmt: skip
 
@@ -75,6 +78,7 @@ class MujocoProblem(WindowModel, WindowedProblem):
             scene, recordings, WINDOW_SEC, WINDOW_SEC - CALM_SEC, most=MOST,
             simulation=MujocoSimulation(scene),
         )  # fmt: skip
+        self.dynamics.friction_of = lambda pair: self._pairs_met.get(pair)
         if any(map(self._by_measured, self.recordings)):
             raise DoesNotFit("measured efforts drive the joints: these drift")
         self.windows = [self._as_smoothed(w) for w in self.windows]
@@ -256,24 +260,21 @@ class MujocoProblem(WindowModel, WindowedProblem):
         calm = self.nuisances().columns @ end.b
         for name, value in effect.parameters.items():
             reach = abs(value - now.get(name, 0.0))
-            steps = reach * np.array(ASIDE)
-            square = [
-                self._try_at(end, k, name, float(value + step), calm)
-                for step in steps if name in std and reach > 0.0
-            ]  # fmt: skip
-            good = np.isfinite(square)
-            if good.sum() < 5:
+            if name not in std or reach == 0.0:
                 continue
-            d, left = steps[good], np.array(square)[good]
-            fit = np.polyfit(d, left, 2)
-            off = left - np.polyval(fit, d)
-            rough = float(np.sqrt(np.sum(off**2) / (len(d) - 3)))
-            if fit[0] <= 0.0:
-                std[name] = np.inf
-                continue
-            low = min(abs(0.5 * fit[1] / fit[0]), reach)
-            wide = np.hypot(low, np.sqrt(max(1.0, 2.0 * rough) / fit[0]))
-            std[name] = max(std[name], float(wide))
+            wide = np.inf
+            for far in FARTHER:
+                steps = far * reach * np.array(ASIDE)
+                left = np.array([
+                    self._try_at(end, k, name, float(value + step), calm)
+                    for step in steps
+                ])  # fmt: skip
+                good = np.isfinite(left)
+                if good.sum() > 4:
+                    wide = min(wide, _by_parabola(steps[good], left[good], reach))
+                if wide < 0.5 * reach:
+                    break
+            std[name] = max(std[name], wide)
         return std, ()
 
     def _try_at(self, end: Fitted, k: int, name: str, value: float, calm) -> float:
@@ -289,13 +290,13 @@ class MujocoProblem(WindowModel, WindowedProblem):
         """Of pairs those that meet, links of a robot among them."""
         if KINDS[kind].at != "pair":
             return super().places_of(kind)
-        return self._pairs_met
+        return sorted(self._pairs_met)
 
     @cached_property
-    def _pairs_met(self) -> list[str]:
+    def _pairs_met(self) -> dict[str, float]:
         with self.simulation.noting_pairs() as met:
             self.simulate(())
-        return sorted(met)
+        return met
 
     def candidates(self, nuisances: Nuisances, current: Fitted) -> list[Candidate]:
         found = super().candidates(nuisances, current)
@@ -317,6 +318,17 @@ class MujocoProblem(WindowModel, WindowedProblem):
         asked = [[p.name for p in e.parameters] for e in KINDS.values() if e.absolute]
         own = self.bodies if names in asked else ()
         return [at for at in self.dynamics.links() if at in joined and at not in own]
+
+
+def _by_parabola(steps: np.ndarray, left: np.ndarray, reach: float) -> float:
+    """How far a parameter may be off, by the sum of squares that is left (n,) at steps
+    from it; at most `reach` by where the parabola's bottom is."""
+    fit = np.polyfit(steps, left, 2)
+    if fit[0] <= 0.0:
+        return np.inf
+    rough = np.sqrt(np.sum((left - np.polyval(fit, steps)) ** 2) / (len(steps) - 3))
+    low = min(abs(0.5 * fit[1] / fit[0]), reach)
+    return float(np.hypot(low, np.sqrt(max(1.0, 2.0 * rough) / fit[0])))
 
 
 def contacts_of_mujoco(problem: MujocoProblem) -> Finding:

@@ -115,6 +115,7 @@ def add_next(
             search.error(t.fit.score) < search.enough(base.score),
         )
         or (strained and _relieves(search, t, current))
+        or (by_evidence and _is_evident(search, t, current))
         for t in trials
     ]  # fmt: skip
     if not worth[pick]:
@@ -132,9 +133,12 @@ def add_next(
 def _relieves(search: Comparison, trial: Trial, current: Fitted) -> bool:
     """Whether nuisances that were where they should not be need not be there any more,
     and the data say the same. (A gap is there then, however little is left.)"""
+    return _is_evident(search, trial, current) and not search.is_strained(trial.fit)
+
+
+def _is_evident(search: Comparison, trial: Trial, current: Fitted) -> bool:
     more = trial.ranked.candidate.size
-    evident = search.evidence(trial.fit, current, more) > EVIDENCE_MIN
-    return evident and not search.is_strained(trial.fit)
+    return search.evidence(trial.fit, current, more) > EVIDENCE_MIN
 
 
 def _ranked(

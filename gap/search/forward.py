@@ -131,7 +131,8 @@ def _converged(search: Comparison, chosen: Sequence[Choice], current: Fitted) ->
     fixed, jumps = fixed_parameters(chosen), search.plan.jumps
     steps = 2 * search.plan.evaluations
     for look in (search_by_blocks, search_far) if jumps else (None,):
-        if not search.needs_more(current):
+        by_evidence = search.plan.counts_evidence and look is search_by_blocks
+        if not search.needs_more(current) and not by_evidence:
             break
         screen = search.screen(current.r, current.fit.train)
         effects: tuple[Effect, ...] | None = current.effects

@@ -27,6 +27,7 @@ from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 
 _PLACES = ("joint", "actuator", "channel", "drive", "pair")
+_ALIKE = ("joint", "pair")  # Where one value may hold for several places.
 # Units of what a joint may have beside what all joints have.
 _FORCES = ("N m", "N m s/rad", "N m/rad", "kg m2")
 
@@ -46,7 +47,32 @@ def groups_of(found: Sequence[Candidate]) -> list[Candidate]:
         )
         for kind, members in by_kind.items()
         if len(members) >= MEMBERS_MIN
+    ] + [
+        _as_one(some)
+        for kind, members in by_kind.items() if KINDS[kind].at == "pair"
+        for some in _of_one_surface(members)
     ]  # fmt: skip
+
+
+def _of_one_surface(pairs: Sequence[Candidate]) -> list[list[Candidate]]:
+    """Those of pairs that have a body in common, and now the same value."""
+    by: dict[tuple, list[Candidate]] = {}
+    for c in pairs:
+        now = c.to_parameters[0](np.zeros(1))
+        for body in c.at[0].split("~"):
+            by.setdefault((body, *now.values()), []).append(c)
+    some = {tuple(c.at for c in each): each for each in by.values()}
+    return [each for each in some.values() if len(each) > 1]
+
+
+def _as_one(some: Sequence[Candidate]) -> Candidate:
+    """Candidates of one kind as one of one value, at all their places."""
+    return replace(
+        some[0], at=tuple(at for m in some for at in m.at),
+        columns=(np.sum([m.columns[0] for m in some], axis=0),),
+        least={name: max(m.least.get(name, -np.inf) for m in some)
+               for name in some[0].least},
+    )  # fmt: skip
 
 
 def of_more_kinds(
@@ -99,7 +125,8 @@ def with_pruned_groups(
         if not of.members:
             out.append(each)
         elif (smaller := _pruned(search, screen, of, of.members)) is not None:
-            out.append(smaller)
+            if not any(_is_same(smaller.candidate, r.candidate) for r in ranked):
+                out.append(smaller)
     return sorted(out, key=lambda r: r.fit.score)
 
 
@@ -139,22 +166,25 @@ def _with_one_value(
     left = screen.fit(_columns_of(members)[0]).held_out
     if not search.tells_by_evidence or left > UNEXPLAINED_RMS:
         return members
-    for kind in dict.fromkeys(m.kind for m in members if KINDS[m.kind].at == "joint"):
+    for kind in dict.fromkeys(m.kind for m in members if KINDS[m.kind].at in _ALIKE):
         some = [m for m in members if m.kind == kind]
         if len(some) < MEMBERS_MIN:
             continue
-        one = replace(
-            some[0], at=tuple(at for m in some for at in m.at),
-            columns=(np.sum([m.columns[0] for m in some], axis=0),),
-            least={name: max(m.least.get(name, -np.inf) for m in some)
-                   for name in some[0].least},
-        )  # fmt: skip
+        one = _as_one(some)
         alike = [one if m is some[0] else m for m in members
                  if m is some[0] or m.kind != kind]  # fmt: skip
         each, whole = (_columns_of(of)[0] for of in (members, alike))
         if not search.evidence_by_columns(screen, each, whole) > 0.0:
             members = alike
     return members
+
+
+def _is_same(one: Candidate, other: Candidate) -> bool:
+    return (
+        one.kind == other.kind
+        and set(one.at) == set(other.at)
+        and (one.size == other.size)
+    )
 
 
 def _parts(candidate: Candidate) -> tuple[Candidate, ...]:

@@ -180,13 +180,16 @@ def without_doubles(search: Comparison, trials: Sequence[Trial]) -> list[Trial]:
 def pick_simplest(
     search: Comparison, trials: Sequence[Trial], found: Sequence[Candidate], base: float
 ) -> int:
-    """Index of the simplest of those that do as well as the best, with four
-    exceptions: a single effect that does nearly all that a group does, another effect
-    for which there is clearly more evidence, the outermost of bodies that are alike,
-    and a kind inside the chosen one that does nearly as well.
+    """Index of the simplest of those that do as well as the best: by evidence where
+    that counts, else by the error. Then with four exceptions: a single effect that does
+    nearly all that a group does, another effect for which there is clearly more
+    evidence, the outermost of bodies that are alike, and a kind inside the chosen one
+    that does nearly as well.
 
     Args: found: all candidates, from the base outwards. base: the error without any.
     """
+    if search.plan.counts_evidence:
+        return _of_most_evidence(search, trials)
     errors = [search.error(t.fit.score) for t in trials]
     pick = simplest(
         errors, [complexity(t.ranked.candidate) for t in trials], SAME_ERROR
@@ -221,6 +224,22 @@ def pick_simplest(
         if inside and near and r.candidate.at == best.candidate.at:
             return k
     return pick
+
+
+def _of_most_evidence(search: Comparison, trials: Sequence[Trial]) -> int:
+    """The simplest of those for which there is as much evidence as for any. (Where
+    contacts chatter the few rows that are held out say less than all.)"""
+    first = trials[0]
+    evidence = [
+        search.evidence(
+            t.fit, first.fit, t.ranked.candidate.size - first.ranked.candidate.size
+        )
+        for t in trials
+    ]
+    near = [k for k, e in enumerate(evidence) if e > max(evidence) - SAME_EVIDENCE]
+    return min(
+        near, key=lambda k: (complexity(trials[k].ranked.candidate), -evidence[k])
+    )
 
 
 def _clearly_better(search: Comparison, trials: Sequence[Trial], pick: int) -> int:

@@ -29,7 +29,7 @@ class MujocoSimulation(SceneSimulation):
         except ValueError as error:
             raise DoesNotFit(str(error)) from None
         super().__init__(scene)
-        self._met: set[str] | None = None
+        self._met: dict[str, float] | None = None
         self.set_effects(scene.effects)
 
     def set_effects(self, effects: Sequence[Effect]) -> None:
@@ -39,16 +39,16 @@ class MujocoSimulation(SceneSimulation):
         self._commands.set_effects(self._current)
 
     @contextmanager
-    def noting_pairs(self) -> Iterator[set[str]]:
+    def noting_pairs(self) -> Iterator[dict[str, float]]:
         """The pairs of bodies that touch in what is simulated meanwhile, the one that
-        is fixed last."""
-        self._met = set()
+        is fixed last, and their friction, the largest of several shapes."""
+        self._met = {}
         try:
             yield self._met
         finally:
             self._met = None
 
-    def _pairs_in(self, states: np.ndarray) -> set[str]:
+    def _note_pairs(self, met: dict[str, float], states: np.ndarray) -> None:
         """Of states (n, n_q + n_v), one in NOTED of them."""
         import mujoco
 
@@ -61,18 +61,17 @@ class MujocoSimulation(SceneSimulation):
             for i in plant.GetBodyIndices(plant.GetModelInstanceByName(name))
         ]
         names = {b.name(): (b.index() in fixed, full_name(plant, b)) for b in bodies}
-        geoms = set[tuple[int, int]]()
+        geoms = dict[tuple[int, int], float]()
         for state in states[::NOTED]:
             data.qpos[:] = state[: model.nq]
             mujoco.mj_kinematics(model, data)
             mujoco.mj_collision(model, data)
-            geoms |= {(c.geom1, c.geom2) for c in data.contact}
-        pairs = set[str]()
-        for pair in geoms:
+            geoms |= {(c.geom1, c.geom2): float(c.friction[0]) for c in data.contact}
+        for pair, friction in geoms.items():
             a, b = (self._twins.body_of(model.geom(g).name) for g in pair)
             if a in names and b in names and a != b:
-                pairs.add("~".join(at for _, at in sorted([names[a], names[b]])))
-        return pairs
+                at = "~".join(at for _, at in sorted([names[a], names[b]]))
+                met[at] = max(friction, met.get(at, 0.0))
 
     def channels(self) -> list[str]:
         """The measured channels that are simulated: no efforts."""
@@ -118,7 +117,7 @@ class MujocoSimulation(SceneSimulation):
         states, _ = rollout(model, data, first[None], control[None], nstep=n)
         every = np.vstack([first, states[0]])[:, 1:]
         if self._met is not None:
-            self._met |= self._pairs_in(every)
+            self._note_pairs(self._met, every)
         path = np.empty((n + 1, len(x)))
         path[:, :n_q] = every[:, twin.q]
         path[:, n_q:] = every[:, model.nq + twin.v]
