@@ -76,7 +76,7 @@ record("monday.csv", friction=0.3, load=1e-6, seed=1)
 def terminal(command):
     """Runs a command of makebreak, and shows what it prints in a terminal."""
     words = [sys.executable, "-m", *shlex.split(command)]
-    wide = os.environ | {"COLUMNS": "84"}  # As wide as this page.
+    wide = os.environ | {"COLUMNS": "96"}  # As wide as this page.
     reader, writer = os.openpty()
     run = subprocess.Popen(words, cwd=folder, env=wide, stdout=writer, stderr=-1)
     os.close(writer)
