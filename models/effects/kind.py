@@ -454,13 +454,16 @@ def find_pair(effect: Effect, plant: MultibodyPlant) -> tuple[RigidBody, RigidBo
     return first, second
 
 
+ONE_DOF = (RevoluteJoint, PrismaticJoint)
+
+
 def one_dof_joints(plant: MultibodyPlant, model: str | None = None) -> list[Joint]:
     """Joints with one degree of freedom, in the order of their velocities' owners."""
     joints = [plant.get_joint(i) for i in plant.GetJointIndices()]
     return [
         joint
         for joint in joints
-        if isinstance(joint, (RevoluteJoint, PrismaticJoint))
+        if isinstance(joint, ONE_DOF)
         and (model is None or model_of(plant, joint) == model)
     ]
 
@@ -492,19 +495,23 @@ def find_joints(effect: Effect, plant: MultibodyPlant) -> list[Joint]:
     found: list[Joint] = []
     for name in effect.at:
         model, _, joint = name.partition(".")
-        models = model_names(plant)
-        if model not in models:
+        if not plant.HasModelInstanceNamed(model):
             raise ValueError(
                 f"effect {effect.kind} at {name!r}: no model {model!r}, "
-                f"the scene has {', '.join(models)}"
+                f"the scene has {', '.join(model_names(plant))}"
             )
-        joints = one_dof_joints(plant, model)
-        chosen = [each for each in joints if not joint or each.name() == joint]
+        instance = plant.GetModelInstanceByName(model)
+        if joint and plant.HasJointNamed(joint, instance):
+            named = plant.GetJointByName(joint, instance)
+            chosen = [named] if isinstance(named, ONE_DOF) else []
+        else:
+            chosen = [] if joint else one_dof_joints(plant, model)
         if not chosen:
+            joints = [each.name() for each in one_dof_joints(plant, model)]
             raise ValueError(
                 f"effect {effect.kind} at {name!r}: expected a joint of {model!r} that "
                 "turns or slides: "
-                f"{', '.join(f'{model}.{each.name()}' for each in joints) or 'none'}"
+                f"{', '.join(f'{model}.{each}' for each in joints) or 'none'}"
             )
         found += chosen
     _refuse_twice(effect, [full_name(plant, joint) for joint in found])
