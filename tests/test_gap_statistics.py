@@ -1143,7 +1143,7 @@ def test_a_patch_beside_others_is_told_by_how_far_it_may_end(
     problem = SimpleNamespace(
         widened=lambda end, k: (moved, ()), least=lambda kind, at: {}
     )
-    search = SimpleNamespace(problem=problem)
+    search = SimpleNamespace(problem=problem, plan=SearchPlan())
     chosen = [choice, *others * [replace(choice)]]
     assert _is_certain(search, chosen, None, 0) == named
 
@@ -1165,8 +1165,21 @@ def test_a_friction_that_may_be_what_the_scene_has_is_not_named(
         dynamics=dynamics,
         least=lambda kind, at: {},
     )
-    search = SimpleNamespace(problem=problem)
+    search = SimpleNamespace(problem=problem, plan=SearchPlan())
     assert _is_certain(search, [choice], None, 0) == named
+
+
+@pytest.mark.parametrize(("score", "named"), [(0.96, False), (0.94, True)])
+def test_what_evidence_takes_must_show_by_the_last_weights(score, named):
+    """Steps of another length are evidence for a damping, which takes nothing off."""
+    effect = Effect("joint_viscous_damping", ["a.j"], {"damping": 0.1})
+    choice = Choice(effect, {"damping": 0.01}, 1.0, score, "", 1.0, (), (), 1)
+    search = object.__new__(Comparison)
+    search.plan = SearchPlan(counts_evidence=True, least_gain=0.05)
+    search.start = SimpleNamespace(score=1.0)  # type: ignore[assignment]
+    search.problem = SimpleNamespace(least=lambda kind, at: {})  # type: ignore[assignment]
+    current = SimpleNamespace(score=score)
+    assert _is_certain(search, [choice], current, 0) == named  # type: ignore[arg-type]
 
 
 def test_moments_of_inertia_are_named_where_one_of_them_is_not_the_scenes():

@@ -319,9 +319,44 @@ def test_a_start_beside_an_impact_is_less_sure_than_smoothing_says(row, times):
     np.testing.assert_allclose(wider.spread["a.box.x"], times * np.eye(2))
 
 
+@pytest.mark.parametrize(("off", "begins_again"), [(1, True), (2, False)])
+def test_a_window_that_takes_the_other_branch_begins_again(off, begins_again):
+    """A foot catches where the start is above 0, as measured; smoothing says -0.3 +- 1.
+    Where most windows are off, it is the model."""
+
+    class Problem(SimpleNamespace):
+        def simulate(self, effects):
+            return [np.full((5, 1), np.sign(w.state["a.x"][0])) for w in self.windows]
+
+        def errors_over(self, simulated, std):
+            return [(1.0 - y) / s for y, s in zip(simulated, std, strict=True)]
+
+        def base(self):
+            return np.concatenate(self.errors_over(self.simulate(()), 3 * [self.noise]))
+
+        def _by_windows(self, left):
+            return np.mean(left.reshape(3, -1) ** 2, axis=1)
+
+    starts = [-0.3] * off + [0.3] * (3 - off)
+    windows = [
+        Window(
+            0, 0, 0.0, slice(0, 5), {"a.x": np.array([x, 0.0, 0.0])}, np.ones((5, 1)),
+            True, {"a.x": np.eye(2)},
+        ) for x in starts
+    ]  # fmt: skip
+    weighed = []
+    problem = Problem(
+        windows=windows, noise=np.array([0.1]), _weigh=lambda e: weighed.append(1)
+    )
+    in_mujoco.MujocoProblem._start_again(problem)  # type: ignore[arg-type]
+    assert (np.abs(problem.base()).max() == 0.0) == begins_again == bool(weighed)
+    assert len(problem.windows) == 3
+
+
 def test_starts_at_random_have_the_covariance_of_all_axes(tmp_path, monkeypatch):
     """With fewer simulations: two for each of them, or for each axis."""
     scene, recordings = pushed(tmp_path, 0.9, "elliptic")
+    monkeypatch.setattr(in_mujoco.MujocoProblem, "_start_again", lambda problem: None)
     made = []
     for most in (100, 12):
         monkeypatch.setattr(in_mujoco, "MOST_MOVES", most)
