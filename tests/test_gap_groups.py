@@ -173,6 +173,31 @@ def test_what_like_joints_have_alike_is_one_number(sizes, places):
         assert e.parameters["coulomb"] == pytest.approx(size, rel=0.05)
 
 
+@pytest.mark.parametrize(
+    ("kind", "sizes", "effects"),
+    [(KINDS[0], (0.7, 0.4, 0.55), [3]), ("contact_friction", (0.5, 0.5, 0.5), [1])],
+)
+def test_a_group_of_which_all_earn_their_place_is_one_candidate(kind, sizes, effects):
+    """Of three joints, a value each; of three pairs of one surface, one for all."""
+    rng = np.random.default_rng(5)
+    n = 900
+    channel, train = np.repeat([0, 1, 2], n), np.arange(3 * n) // 30 % 3 != 1
+    left, found = rng.normal(size=3 * n), []
+    for k, size in enumerate(sizes):
+        column = np.where(channel == k, 30.0 * rng.normal(size=3 * n), 0.0)
+        left += size * column
+        at = f"r.b~r.w{k}" if kind == "contact_friction" else f"r.j{k}"
+        name = "friction" if kind == "contact_friction" else "coulomb"
+        read = (lambda c, name=name: {name: float(c[0])},)
+        found.append(Candidate(kind, (at,), 1, (column[:, None],), read))
+    screen = Screen(left, np.zeros((3 * n, 0)), np.zeros(0), train)
+    pruned = with_pruned_groups(
+        search_of(left, train, channel), screen, rank(screen, groups_of(found))
+    )
+    whole = [p for p in pruned if sum(len(e.at) for e in p.effects) == 3]
+    assert [len(p.effects) for p in whole] == effects
+
+
 def effect_at(joint, value, ties=()):
     unit = "N m s/rad"
     return NamedEffect(

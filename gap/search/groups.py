@@ -119,14 +119,15 @@ def with_pruned_groups(
     """Candidates, the best first, with groups reduced to the members that earn their
     place, or to one value for all of them; a group that is left at fewer than two
     places is dropped."""
-    out = []
-    for each in ranked:
-        of = each.candidate
-        if not of.members:
-            out.append(each)
-        elif (smaller := _pruned(search, screen, of, of.members)) is not None:
-            if not any(_is_same(smaller.candidate, r.candidate) for r in ranked):
-                out.append(smaller)
+    out = [each for each in ranked if not each.candidate.members]
+    there = {(r.candidate.kind, frozenset(r.candidate.at)) for r in out}
+    for of in (r.candidate for r in ranked if r.candidate.members):
+        smaller = _pruned(search, screen, of, of.members)
+        if smaller is None:
+            continue
+        new = smaller.candidate  # One value for a surface's pairs may be there already.
+        if new.members or (new.kind, frozenset(new.at)) not in there:
+            out.append(smaller)
     return sorted(out, key=lambda r: r.fit.score)
 
 
@@ -177,14 +178,6 @@ def _with_one_value(
         if not search.evidence_by_columns(screen, each, whole) > 0.0:
             members = alike
     return members
-
-
-def _is_same(one: Candidate, other: Candidate) -> bool:
-    return (
-        one.kind == other.kind
-        and set(one.at) == set(other.at)
-        and (one.size == other.size)
-    )
 
 
 def _parts(candidate: Candidate) -> tuple[Candidate, ...]:
