@@ -172,7 +172,7 @@ def test_contact_that_takes_too_long_leaves_time_for_what_is_free(case, monkeypa
     monkeypatch.setattr(workflow, "runs_against", lambda *_: True)
     monkeypatch.setattr(workflow, "_impact_problem", endless)
     scene, recordings = read_scene(case[0]), read_recordings([case[1]])
-    with Budget(1.0).running() as budget:
+    with Budget(4.0).running() as budget:
         problem, _ = workflow.problem_for(scene, recordings, SceneDynamics(scene))
         assert isinstance(problem, MechanismProblem)
     assert budget.undone == ["what touches: its stretches are left out"]
