@@ -1,6 +1,6 @@
 """Candidates fitted exactly: which ones are worth it, and which of them is taken."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -236,10 +236,7 @@ def _of_most_evidence(search: Comparison, trials: Sequence[Trial]) -> int:
         )
         for t in trials
     ]
-    near = [k for k, e in enumerate(evidence) if e > max(evidence) - SAME_EVIDENCE]
-    return min(
-        near, key=lambda k: (complexity(trials[k].ranked.candidate), -evidence[k])
-    )
+    return _simplest_near(trials, dict(enumerate(evidence)), -np.inf)
 
 
 def _clearly_better(search: Comparison, trials: Sequence[Trial], pick: int) -> int:
@@ -265,7 +262,15 @@ def _clearly_better(search: Comparison, trials: Sequence[Trial], pick: int) -> i
     most = max(evidence.values(), default=0.0)
     if not most > EVIDENCE_MIN:
         return pick
-    near = [k for k, e in evidence.items() if e > max(most - SAME_EVIDENCE, 0.0)]
+    return _simplest_near(trials, evidence, 0.0)
+
+
+def _simplest_near(
+    trials: Sequence[Trial], evidence: Mapping[int, float], least: float
+) -> int:
+    """Of those with as much evidence as any, and more than `least`."""
+    enough = max(max(evidence.values()) - SAME_EVIDENCE, least)
+    near = [k for k, e in evidence.items() if e > enough]
     return min(
         near, key=lambda k: (complexity(trials[k].ranked.candidate), -evidence[k])
     )
