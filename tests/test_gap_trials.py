@@ -7,8 +7,9 @@ import pytest
 
 from makebreak.gap.problem import SearchPlan
 from makebreak.gap.residuals.impacts import candidates_of
-from makebreak.gap.residuals.in_mujoco import _by_parabola
+from makebreak.gap.residuals.in_mujoco import MujocoProblem, _by_parabola
 from makebreak.gap.search.trials import pick_simplest
+from makebreak.models.effects.kind import Effect
 
 
 def test_a_trial_takes_off_what_it_explains():
@@ -63,3 +64,16 @@ def test_a_parabola_says_how_far_a_parameter_may_be_off():
     rough = 8.0 * np.cos(np.pi * np.arange(9))
     assert _by_parabola(steps, (steps / 0.2) ** 2 + rough, 1.0) > 2.0 * at_bottom
     assert _by_parabola(steps, -(steps**2), 1.0) == np.inf
+
+
+def test_an_interval_is_asked_of_the_sum_of_squares_about_its_value():
+    """One deviation of 0.1 about 1.2, where the scene has 0.7."""
+    effect = Effect("joint_viscous_damping", ["a.b"], {"damping": 1.2})
+    problem = SimpleNamespace(
+        dynamics=SimpleNamespace(now=lambda kind, at: {"damping": 0.7}),
+        nuisances=lambda: SimpleNamespace(columns=np.zeros((1, 0))),
+        _try_at=lambda end, k, name, value, calm: ((value - 1.2) / 0.1) ** 2,
+    )
+    end = SimpleNamespace(effects=[effect], std=[{"damping": 1e-4}], b=np.zeros(0))
+    std, _ = MujocoProblem.widened(problem, end, 0)  # type: ignore[arg-type]
+    assert std["damping"] == pytest.approx(0.1)
