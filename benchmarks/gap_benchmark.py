@@ -28,6 +28,7 @@ from makebreak.benchmarks.gap_scoring import (
     score,
     table_of,
 )
+from makebreak.scripts.runner.outputs import is_complete
 from makebreak.scripts.runner.session import Session
 from makebreak.scripts.runner.shown import is_quiet
 from makebreak.scripts.runner.table import Table, json_value
@@ -128,7 +129,7 @@ def run_benchmark(
     scores: dict[str, Score] = {}
 
     def is_done(i: int) -> bool:
-        return reuse and (folders[i] / "result.json").is_file()
+        return reuse and is_complete(folders[i])
 
     def ended(i: int, result: dict) -> None:
         name, out = names[i], folders[i]

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from makebreak.benchmarks.rows import check_named
 from makebreak.scripts.runner.close_contact_loop import SETTINGS
+from makebreak.scripts.runner.outputs import is_complete
 from makebreak.scripts.runner.table import Table
 from makebreak.scripts.runner.trials import makebreak_command, run_commands
 
@@ -47,7 +48,7 @@ def reproduce(
     ]  # fmt: skip
 
     def is_done(i: int) -> bool:
-        return session.reuse and (folders[i] / "result.json").exists()
+        return session.reuse and is_complete(folders[i])
 
     results = run_commands("loops", commands, folders, jobs, is_done)
     rows: list[tuple] = []

@@ -1,7 +1,10 @@
 """The benchmark's score says what it claims; the benchmark itself is not run here."""
 
 import json
+import signal
+import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +21,7 @@ from makebreak.benchmarks.gap_scoring import (
     table_of,
 )
 from makebreak.scripts.cli import commands as cli
+from makebreak.scripts.runner import trials
 
 
 def truth(verdict="gap_named", effects=(), ties=()):
@@ -347,10 +351,27 @@ a.truth.write_text(json.dumps(truth))
 """
 GAP = """import json, sys
 from pathlib import Path
+from makebreak.scripts.runner.outputs import OutputFolder
+from makebreak.scripts.runner.parent import end_with_parent
+end_with_parent()
 out = Path(sys.argv[sys.argv.index("--out") + 1])
 assert not list(out.parent.parent.glob("cases/*/truth*"))
-(out / "result.json").write_text(json.dumps({"verdict": "no_gap", "effects": []}))
-(out / "timing.json").write_text('{"wall_s": 3.0}')
+with OutputFolder(out, "gap") as files:
+    answer = {"verdict": "no_gap", "effects": []}
+    files.file("result.json").write_text(json.dumps(answer))
+    files.file("timing.json").write_text('{"wall_s": 3.0}')
+    files.commit()
+"""
+# `reproduce gap --out out MORE`, with a maker and a workflow from files.
+REPRODUCE = """import sys
+from dataclasses import replace
+from pathlib import Path
+from makebreak.benchmarks import gap_benchmark
+from makebreak.scripts.cli import main
+standard = replace(gap_benchmark.SETS["standard"], maker=Path("cases.py").resolve())
+gap_benchmark.SETS["standard"] = standard
+gap_benchmark.makebreak_command = lambda *words: [sys.executable, "gap.py", *words]
+sys.exit(main(["reproduce", "gap", "--jobs", "1", "--out", "out", *sys.argv[1:]]))
 """
 
 
@@ -374,6 +395,48 @@ def test_a_case_that_never_ends_is_stopped_and_the_others_are_scored(
     assert rows["right verdict gap_named (1)"] == "no_gap 1"
     scores = json.loads((tmp_path / "scores.json").read_text())
     assert scores[0]["says"] == "stopped after 3 s"
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_a_benchmark_that_was_ended_goes_on_where_it_was(number, tmp_path):
+    def start(*words):
+        return subprocess.Popen(
+            [sys.executable, "-c", REPRODUCE, *words],
+            cwd=tmp_path,
+            env=trials.run_environment(),
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+    (tmp_path / "cases.py").write_text(MAKER)
+    # The second case waits until it is ended, and leaves an incomplete answer.
+    waits = """
+    if out.name == "case_2":
+        def end(*_):
+            files.file("result.json").write_text("{}")
+            files.commit(complete=False)
+            sys.exit(130)
+        import signal, time
+        signal.signal(signal.SIGTERM, end)
+        Path("waits").touch()
+        time.sleep(60.0)
+"""
+    (tmp_path / "gap.py").write_text(GAP.replace(" as files:\n", f" as files:{waits}"))
+    process = start()
+    end = time.monotonic() + 60.0
+    while not (tmp_path / "waits").exists():
+        assert process.poll() is None and time.monotonic() < end
+        time.sleep(0.02)
+    process.send_signal(number)
+    process.wait(timeout=60)
+    [first, second] = [tmp_path / f"out/gap/results/case_{k}" for k in (1, 2)]
+    assert (second / "result.json").exists() == (number == signal.SIGTERM)
+    before = (first / "result.json").stat().st_mtime_ns
+    (tmp_path / "gap.py").write_text(GAP)
+    process = start("--reuse")
+    assert process.communicate(timeout=60)[0].count("1 of 2 (50%)") == 1
+    assert (first / "result.json").stat().st_mtime_ns == before
+    assert json.loads((second / "result.json").read_text())["verdict"] == "no_gap"
 
 
 def test_an_unknown_set_is_refused_by_name(capsys, tmp_path, monkeypatch):

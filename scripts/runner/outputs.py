@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterable
+from contextlib import suppress
 from datetime import datetime
 from hashlib import sha256
 from pathlib import Path
@@ -58,6 +59,8 @@ class OutputFolder:
         try:
             self._enter()
             self._old = self._check(only_new)
+            if not self._old:  # So that files of a killed run are known.
+                self._mark(self.path, {}, complete=False)
         except OSError as error:
             self.close()
             raise ValueError(
@@ -135,20 +138,10 @@ class OutputFolder:
     def _check(self, only_new: bool) -> dict:
         """The mark of an earlier result of this command; empty without one."""
         mark = _read_mark(self.path)
-        strangers = sorted(
-            each.name
-            for each in self.path.iterdir()
-            if not each.name.startswith(".") and each.name != "log.txt"
-        )
-        if not mark:
-            if not only_new:
-                strangers = [
-                    name
-                    for name in strangers
-                    if name in _NAMES or Path(name).suffix in _SUFFIXES
-                ]
-            if strangers:
-                self._refuse(f"holds {strangers[0]}, which makebreak did not write")
+        strangers = self._unlisted(only_new)
+        if strangers and not mark:
+            self._refuse(f"holds {strangers[0]}, which makebreak did not write")
+        if not strangers and not mark.get("files"):
             return {}
         if mark["command"] != self.command:
             self._refuse(f"holds the files of makebreak {mark['command']}")
@@ -159,6 +152,15 @@ class OutputFolder:
             if path.is_file() and _digest(path) != digest:
                 self._refuse(f"holds {name}, which was changed by hand")
         return mark
+
+    def _unlisted(self, every: bool = False) -> list[str]:
+        """Files that need a mark; every: not only those that look like a command's."""
+        return sorted(
+            each.name
+            for each in self.path.iterdir()
+            if not each.name.startswith(".") and each.name != "log.txt"
+            and (every or each.name in _NAMES or each.suffix in _SUFFIXES)
+        )  # fmt: skip
 
     def file(self, name: str) -> Path:
         """The path to write the file `name` to; makes its folder."""
@@ -258,6 +260,10 @@ class OutputFolder:
         if self._lock is not None:
             if not keep_stage:
                 shutil.rmtree(self.stage, ignore_errors=True)
+            mark = _read_mark(self.path)
+            with suppress(OSError):
+                if not (mark.get("complete") or mark.get("files") or self._unlisted()):
+                    (self.path / MARK).unlink()
             os.close(self._lock)
             self._lock = None
         for folder in self._made:  # Only empty ones can be removed.
@@ -272,6 +278,11 @@ class OutputFolder:
 
     def __exit__(self, *_) -> None:
         self.close()
+
+
+def is_complete(folder: Path) -> bool:
+    """Whether a command has written all of its files there."""
+    return bool(_read_mark(folder).get("complete"))
 
 
 def _read_mark(folder: Path) -> dict:
