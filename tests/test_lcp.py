@@ -335,6 +335,23 @@ def test_gaps_that_open_far_faster_spoil_no_small_force():
             assert_solves(F, q, solve_lcp(F, q))
 
 
+def test_friction_stops_a_block_however_slowly_it_slides():
+    """A block of 1 kg that lands at 1 m/s, with eight friction edges: beside its normal
+    speed all edges of a slip below 1e-12 were tied, and no answer was precise."""
+    angle, rng = 0.25 * np.pi * np.arange(8), np.random.default_rng(0)
+    t, F = np.column_stack([np.cos(angle), np.sin(angle)]), np.zeros((10, 10))
+    F[0, 0], F[1:9, 1:9] = 1.0, t @ t.T
+    F[:9, :9] += 1e-3 * np.eye(9)
+    F[1:9, 9], F[9, 0], F[9, 1:9] = 1.0, 0.5, -1.0
+    for decade in range(-15, 0):
+        for _ in range(8):
+            slip = 10.0**decade * rng.uniform(-1.0, 1.0, 2)
+            lam = solve_lcp(F, np.array([-1.0, *(t @ slip), 0.0]))
+            # The contact gives by 1e-3 of a force that is spread over eight edges.
+            left = slip + t.T @ lam[1:9]
+            assert abs(left).max() < 1e-3 * abs(slip).max() + 1e-15
+
+
 def test_a_speed_that_is_rounding_decides_nothing():
     """A row whose own terms are rounding of q beside speeds of 1."""
     F = np.diag([1.0, 0.0, 2.0])

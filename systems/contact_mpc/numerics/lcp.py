@@ -19,9 +19,12 @@ from makebreak.systems.contact_mpc.numerics.nearest_point import nearest_mode
 
 # Modes that the search behind Lemke's method looks at.
 NODES_MAX = 2000
-# Pivots after which later tries of Lemke's method compute their tableau anew; the last
-# one does after each.
+# Pivots after which the second try of Lemke's method computes its tableau anew; the
+# third does after each.
 REBUILD = 10
+# Largest force or speed of a contact that is solved again in the unit of such contacts,
+# in units in which diag(M) and max |b| are 1.
+SMALL = 1e-3
 # Largest force z, in units in which diag(M) and max |b| are 1, that counts as the scale
 # of a rounding error; larger ones are no excuse for a breach of w >= 0.
 Z_SCALE_MAX = 1e2
@@ -93,24 +96,18 @@ def solve_lcp_kernel(F, q):
         for j in range(n):
             M[i, j] = scale[i] * F[i, j] * scale[j]
     status = NOT_PRECISE
-    # A pivot below the tolerance is taken for rounding. Where that was wrong the check
-    # at the end says so, and another tolerance is tried, or a tableau without the
-    # rounding errors of many pivots; or the unit of the largest closing speed, beside
-    # which gaps that open far faster decide no tie.
-    closing, best, found = -b.min(), np.inf, np.zeros(n)
-    for tolerance, rebuild, unit in (
-        (1e-11, 0, 1.0),
-        (1e-11, 0, closing),
-        (1e-11, REBUILD, 1.0),
-        (1e-9, REBUILD, 1.0),
-        (1e-13, REBUILD, 1.0),
-        (1e-11, 1, 1.0),
-    ):
-        z, status = _lemke(M, b / unit, tolerance, rebuild)
+    # What is tied but for rounding of the largest speed is no tie for far smaller ones:
+    # where the check says so, those are solved once more, beside what the others do;
+    # and then all, by a tableau without the rounding errors of many pivots.
+    best, found = np.inf, np.zeros(n)
+    for rebuild in (0, REBUILD, 1):
+        z, status, basic = _lemke(M, b, 1e-11, rebuild)
         if status == SOLVED:
-            status, wrong = NOT_PRECISE, _violation(M, b, unit * z)
-            if wrong < best:
-                best, found = wrong, unit * z
+            status, best = NOT_PRECISE, _violation(M, b, z)
+            found[:] = z
+            if not best < 1e-9:
+                _solve_small(M, b, basic, found)
+                best = _violation(M, b, found)
             if best < 1e-9:
                 break
     # Where feasible w leave no room (a wedge), rounding in q alone makes a ray. Then a
@@ -175,13 +172,42 @@ def _units(F):
 
 
 @njit(cache=True)
+def _solve_small(M, b, basic, z):
+    """Solves what is below SMALL in the solution z (n,) once more, in a unit of its
+    own, with the other contacts as they are in `basic` (n,); overwrites both."""
+    n = b.size
+    T = np.empty((n, 2 * n + 2))
+    if basic.max() == 2 * n or not _rebuild(T, M, b, basic):  # z0 is in no solution.
+        return
+    rows = np.flatnonzero(np.abs(T[:, 2 * n + 1]) < SMALL)
+    s = T[rows, 2 * n + 1]
+    if rows.size == 0 or s.min() >= 0.0:
+        return
+    others = (basic[rows] + n) % (2 * n)
+    S = np.empty((rows.size, rows.size))
+    for i in range(rows.size):
+        for j in range(rows.size):
+            S[i, j] = -T[rows[i], others[j]]
+    unit = np.abs(s).max()
+    y, status, _ = _lemke(S, s / unit, 1e-11, 0)
+    value = T[:, 2 * n + 1] - T[:, others] @ (unit * y)
+    z[:] = 0.0
+    for k in range(n):
+        if basic[k] >= n:
+            z[basic[k] - n] = max(value[k], 0.0)
+    for i in range(rows.size):
+        if others[i] >= n:
+            z[others[i] - n] = unit * y[i]
+
+
+@njit(cache=True)
 def _regular(M, b, more, rebuild, z):
     """Fills z (n,) with the solution for `more` on M's diagonal; returns its violation
     in the LCP itself, times |z| if large; infinite without a solution."""
     R = M.copy()
     for i in range(b.size):
         R[i, i] += more
-    z[:], status = _lemke(R, b, 1e-13, rebuild)
+    z[:], status, _ = _lemke(R, b, 1e-13, rebuild)
     return _violation(M, b, z) * max(1.0, z.max()) if status == SOLVED else np.inf
 
 
@@ -213,7 +239,8 @@ def _search(M, b, z):
 
 @njit(cache=True)
 def _lemke(M, b, tolerance, rebuild):
-    """Lemke's method on w - M z - 1 z0 = b; returns z (n,) and a status.
+    """Lemke's method on w - M z - 1 z0 = b; returns z (n,), a status, and the basis
+    (n,): the column of each row, see _fill.
 
     rebuild: number of pivots after which the tableau is computed anew; 0: never.
     """
@@ -236,18 +263,18 @@ def _lemke(M, b, tolerance, rebuild):
         basic[row] = entering
         if leaving == z0:
             _read(T, M, b, basic, z)
-            return z, SOLVED
+            return z, SOLVED, basic
         entering = leaving + n if leaving < n else leaving - n
         if rebuild and pivots % rebuild == 0 and not _rebuild(T, M, b, basic):
-            return z, NOT_PRECISE
+            return z, NOT_PRECISE, basic
         row = _lexicographic_row(T, entering, basic, z0, rhs, tolerance)
         if row < 0:
             for i in range(n):  # A tie that rounding has hidden: z0 is gone.
                 if basic[i] == z0 and abs(T[i, rhs]) < 1e-11:
                     _read(T, M, b, basic, z)
-                    return z, SOLVED
-            return z, NO_SOLUTION
-    return z, NOT_PRECISE
+                    return z, SOLVED, basic
+            return z, NO_SOLUTION, basic
+    return z, NOT_PRECISE, basic
 
 
 @njit(cache=True)
