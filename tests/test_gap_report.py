@@ -23,6 +23,7 @@ from makebreak.gap.report.interactive import (
     shown_series,
 )
 from makebreak.gap.report.markup import headline, sentence_html
+from makebreak.gap.report.page import _first_screen
 from makebreak.gap.report.pictures import picture_of_series, picture_of_where
 from makebreak.gap.report.sections import considered, evidence, series
 from makebreak.gap.report.summary import next_best, summary_lines
@@ -40,10 +41,12 @@ from makebreak.gap.result import (
 )
 from makebreak.gap.simulation.commands import Commands
 from makebreak.gap.simulation.scene_simulation import SceneSimulation
+from makebreak.gap.verdict import says
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, sentence
 from makebreak.models.scene import InitialSection, read_scene
 from makebreak.models.scene_file import write_scene
+from makebreak.scripts.cli.gap_command import effects_table
 from makebreak.scripts.runner.browser import BROWSERS, Browser
 
 COULOMB = Effect("joint_coulomb_friction", ["p.j1"], {"coulomb": 0.35})
@@ -375,6 +378,35 @@ def test_the_files_are_those_of_the_design(case, tmp_path):
     assert read_scene(tmp_path / "scene.yaml").effects == [COULOMB]
     page = (tmp_path / "report.html").read_text()
     assert 'href="compare.html"' in page and 'src="compare.html#small"' in page
+
+
+def test_each_effect_is_told_once(case):
+    """Four joints of which one sentence tells, and an actuator: on the first screen of
+    the page, and in the terminal."""
+    [one] = case[2].effects
+    values = [Estimate(0.1 * k, 0.01, "N m") for k in range(1, 5)]
+    effects = [
+        replace(one, at=(f"p.j{k}",), parameters={"coulomb": value})
+        for k, value in enumerate(values, 1)
+    ]
+    gain = Estimate(0.8234, 0.0003, "")
+    words = f"The actuator of p.j1 gives {gain.text()} times its torque."
+    gains = {"gain": gain}
+    lone = replace(one, kind="actuator_gain", parameters=gains, says=words)
+    effects.append(lone)
+    told = says("gap_named", effects, case[2].gap)
+    assert "Each of 4 joints" in told and "p.j3" not in told
+    result = replace(case[2], effects=effects, says=told)
+    page = text_of(_first_screen(result, {}, False))
+    table = effects_table(result, told).to_text()
+    for each in (*values, gain):
+        assert page.count(each.text()) == table.count(each.text()) == 1
+    assert page.count("that the model lacks") == table.count("that the model lacks")
+    assert page.count("that the model lacks") == 1
+    assert "errors in units of the expected error" in table
+    alone = replace(case[2], effects=[lone], says=words)
+    assert "parameters" not in effects_table(alone, alone.says).columns
+    assert "parameters" in effects_table(alone).columns
 
 
 def test_effects_that_the_scene_had_are_kept_before_the_new(case, tmp_path):

@@ -13,11 +13,13 @@ from makebreak.gap.report.summary import (
     doubts,
     heading_of,
     next_best,
+    not_told,
     number,
     says_of,
     windows_of,
 )
 from makebreak.gap.result import GapResult, NamedEffect, Unexplained
+from makebreak.gap.said import said_together
 
 
 def report_html(
@@ -76,7 +78,7 @@ def _first_screen(
         headline(result.says),
         _doubts(result),
         '<div class="two"><div>',
-        *[_effect(each, result, i) for i, each in enumerate(result.effects)],
+        *[_effects(*each, result) for each in said_together(result.effects)],
         _no_effect(result) if not result.effects else "",
         "</div><div>",
         _numbers(result),
@@ -106,28 +108,30 @@ def _doubts(result: GapResult) -> str:
     )
 
 
-def _effect(each: NamedEffect, result: GapResult, i: int) -> str:
-    rows = ""
-    for name, p in each.parameters.items():
-        value = sentence_html(p.text())
-        rows += f"<tr><td>{escape(name)}</td><td class=n>{value}</td>"
-        rows += f"<td>{escape(p.unit)}</td></tr>"
-    other = next_best(each.evidence)
-    sure = f"Next best: {escape(other)}." if other else ""
-    if each.identifiable == "weak":
-        sure += " It is only weakly identifiable from these data."
-    elif each.identifiable == "not":
-        sure += " Its parameters are not identifiable from these data."
-    # Of a lone effect the headline is its sentence.
-    title = ""
-    if len(result.effects) > 1 or each.says not in result.says:
-        count = f"{i + 1}. " if len(result.effects) > 1 else ""
-        title = f"<h3>{count}{sentence_html(each.says)}</h3>"
+def _effects(said: str, same: Sequence[NamedEffect], result: GapResult) -> str:
+    """Of effects that one sentence tells what the headline has not told."""
+    kind, at, rows = same[0].kind, "", ""
+    if len(same) == 1:
+        at = f" at {', '.join(same[0].at)}"
+    for each in same:
+        for name, p in not_told(each, result.says).items():
+            of = name if len(same) == 1 else ", ".join(each.at)
+            value = f"<td class=n>{sentence_html(p.text())}</td><td>{escape(p.unit)}"
+            rows += f"<tr><td>{escape(of)}</td>{value}</td></tr>"
+    others = dict.fromkeys(filter(None, (next_best(e.evidence) for e in same)))
+    sure = f"Next best: {escape('; '.join(others))}." if others else ""
+    for state, words in _HARDLY.items():
+        if places := [", ".join(e.at) for e in same if e.identifiable == state]:
+            sure += f" {words} from these data"
+            sure += f": {escape('; '.join(places))}." if len(same) > 1 else "."
+    title = "" if said in result.says else f"<h3>{sentence_html(said)}</h3>"
     return (
-        f'<div class="effect">{title}<p class="kind">{escape(each.kind)} '
-        f"at {escape(', '.join(each.at))}</p>"
-        f"<table>{rows}</table><p>{sure}</p>{_ties(each)}</div>"
+        f'<div class="effect">{title}<p class="kind">{escape(kind + at)}</p>'
+        f"<table>{rows}</table><p>{sure}</p>{_ties(same[0])}</div>"
     )
+
+
+_HARDLY = {"weak": "Only weakly identifiable", "not": "Not identifiable"}
 
 
 def _ties(each: NamedEffect) -> str:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from makebreak.gap.data.findings import Finding
-from makebreak.gap.result import Evidence, GapResult
+from makebreak.gap.result import Estimate, Evidence, GapResult, NamedEffect
 from makebreak.gap.said import said_together
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, sentence
@@ -47,6 +47,12 @@ def summary_lines(result: GapResult) -> list[str]:
         if none.why not in result.says:
             lines.append(f"  Tried, not confirmed: {none.says} {none.why}")
     return lines
+
+
+def not_told(each: NamedEffect, says: str) -> dict[str, Estimate]:
+    """The parameters of an effect whose values are not in what a result says."""
+    told = each.says if each.says in says else ""
+    return {name: p for name, p in each.parameters.items() if p.text() not in told}
 
 
 def doubts(result: GapResult) -> list[tuple[str, list[str]]]:

@@ -253,7 +253,7 @@ def _gap_until(args, interrupt, drake) -> int:
             raise
         kept = out / "error.txt"
         return fault(error, kept) if kept.exists() else refused(error)
-    show(effects_table(result))
+    show(effects_table(result), effects_table(result, told=result.says))
     for note in notes:
         print(note)
     drake.show()

@@ -24,8 +24,14 @@ from makebreak.gap.data.sidecar import has_sidecar, has_sidecars, sidecar_of
 from makebreak.gap.report.comparison import comparison, comparison_html
 from makebreak.gap.report.files import write_report
 from makebreak.gap.report.mcap_file import write_mcap
-from makebreak.gap.report.summary import next_best, summary_lines, windows_of
+from makebreak.gap.report.summary import (
+    next_best,
+    not_told,
+    summary_lines,
+    windows_of,
+)
 from makebreak.gap.result import GapResult
+from makebreak.gap.said import figure
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import sliding_joints
 from makebreak.models.scene import Scene, read_scene
@@ -369,28 +375,33 @@ def write_comparison(
     return write_mcap(path, [motion], loaded)
 
 
-def effects_table(result: GapResult) -> Table:
-    """The table at the end of a run: the effects found and the held-out error."""
+def effects_table(result: GapResult, told: str = "") -> Table:
+    """The table at the end of a run: the effects found and the held-out error.
+
+    Args: told: text whose values are left out.
+    """
     rows: list[tuple] = []
     for each in result.effects:
         values = ", ".join(
             f"{name} {p.text()} {p.unit}".rstrip()
-            for name, p in each.parameters.items()
+            for name, p in not_told(each, told).items()
         )
         rows.append((each.kind, list(each.at), values, next_best(each.evidence) or "-"))
     g = result.gap
     notes = []
     if isfinite(g.before):
+        before, after = figure(g.before), figure(g.after)
+        pair = f"held-out error: {before} before, {after} after,"
         notes.append(
-            f"held-out error: {g.before:.3g} before, {g.after:.3g} after, in units of "
-            f"the expected error (rms over {windows_of(result)}; a perfect model "
-            "leaves 1)"
+            f"{'errors' if before in told and after in told else pair} in units of the "
+            f"expected error (rms over {windows_of(result)}; a perfect model leaves 1)"
         )
     if g.in_equations:
-        before, after = g.in_equations
         notes.append(
-            f"in the equations of motion of the same data: {before:.3g} before, "
-            f"{after:.3g} after"
+            "in the equations of motion of the same data: {:.3g} before, {:.3g} "
+            "after".format(*g.in_equations)
         )
     columns = ("effect", "at", "parameters", "next best")
+    if not any(row[2] for row in rows):
+        columns, rows = ("effect", "at", "next best"), [r[:2] + r[3:] for r in rows]
     return Table("\n".join(summary_lines(result)), columns, rows, notes=notes)
