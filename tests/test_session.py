@@ -554,6 +554,24 @@ def test_a_table_fits_the_terminal():
     assert lines[5:7] == [f"{'b':19}  many words of a", " " * 21 + "sentence"]
 
 
+def test_a_narrow_terminal_breaks_no_name():
+    """Neither of two that do not fit side by side, nor at a hyphen."""
+    name, channel = "arm.joint-1.effort_measured", "arm.joint1.effort_measured"
+    heads = ("column", "samples", "empty", "proposed channel", "reason")
+    why = "has a channel's name already"
+    table = Table(f"/tmp/a-b/{name}", heads, [(name, 12, "", channel, why)] * 2)
+    for width in (20, 40, 60, 80, 100):
+        lines = table.to_text(width).splitlines()
+        assert sum(name in line.split() for line in lines) == 2
+        assert sum(channel in line.replace(";", "").split() for line in lines) == 2
+        assert max(map(len, lines)) <= max(width, len(lines[0]))
+    assert table.to_text(60).splitlines()[2:5] == [
+        name,
+        "    samples: 12; proposed channel:",
+        f"    {channel}; reason: has a channel's name",
+    ]
+
+
 @pytest.mark.parametrize(
     ("value", "text", "in_json"),
     [

@@ -27,8 +27,8 @@ from makebreak.models.scene_reader import given_packages
 from makebreak.scripts.runner.outputs import OutputFolder
 from makebreak.scripts.runner.table import Table, json_value
 
-_HEADS = ("column", "samples", "rate [Hz]", "longest hole [s]", "min", "max",
-          "repeated", "proposed channel", "reason")  # fmt: skip
+_HEADS = ("column", "proposed channel", "reason", "samples", "rate [Hz]",
+          "longest hole [s]", "min", "max", "repeated")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class Inspected:
                 share = "" if np.isnan(c.repeated) else f"{c.repeated:.0%}"
                 numbers = (c.rate, c.hole, c.low, c.high)
                 cells = [c.samples, *map(_short, numbers), share]
-            rows.append((m.column, *cells, target, m.why))
+            rows.append((m.column, target, m.why, *cells))
         title = f"{self.path}: {self.rows} rows"
         if np.isfinite(self.duration):
             title += f", {self.duration:.4g} s"

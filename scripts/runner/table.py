@@ -12,7 +12,8 @@ import numpy as np
 # word in a quotation or in a name such as position_nan.
 _NAN = re.compile(r"(?<![\w.\"'])nan(?![\w\"'])")
 
-_NARROW = 16  # Characters of a column that is not made narrower.
+_NARROW = 8  # Characters of a heading that is not broken.
+_WHOLE = {"break_long_words": False, "break_on_hyphens": False}  # Names can be copied.
 
 
 @dataclass(frozen=True)
@@ -72,8 +73,9 @@ class Table:
     def to_text(self, width: int | None = None) -> str:
         """The table in aligned columns, numbers to the right, under its title.
 
-        Args: width: of the terminal [characters], to which columns of text are wrapped;
-            None: a line for each row, as for grep.
+        Args: width: of the terminal [characters], to which columns of text are wrapped
+            between words; where that does not do, each row is a paragraph. None: a line
+            for each row, as for grep.
         """
         heads, rows = self.cells()
         widths = [max(map(len, col)) for col in zip(heads, *rows, strict=True)]
@@ -86,11 +88,10 @@ class Table:
         longest = [
             [max(map(len, c.split()), default=1) for c in col] for col in columns
         ]
-        for least in (  # Words are broken where it has to be: first those of headings.
+        for least in (  # Headings are broken where it has to be.
             [max(of) for of in longest],
-            [max([_NARROW // 2, *of[1:]]) for of in longest],
-            [max(longest[j][1:]) if r else _NARROW for j, r in enumerate(right)],
-        ):  # fmt: skip
+            [max([_NARROW, *of[1:]]) for of in longest],
+        ):
             while over > 0 and (
                 can := [j for j, w in enumerate(widths) if w > least[j]]
             ):
@@ -98,7 +99,10 @@ class Table:
                 over -= 1
 
         def line(cells):
-            parts = [wrap(c, w) or [""] for c, w in zip(cells, widths, strict=True)]
+            parts = [
+                wrap(c, w, break_on_hyphens=False) or [""]
+                for c, w in zip(cells, widths, strict=True)
+            ]
             lines = []
             for row in zip_longest(*parts, fillvalue=""):
                 pad = [
@@ -110,10 +114,12 @@ class Table:
 
         rule = "  ".join("-" * w for w in widths)
         around = [
-            each if width is None else fill(each, width)
+            each if width is None else fill(each, width, **_WHOLE)
             for each in (self.title, *self.notes)
         ]
         body = [line(heads), rule, *map(line, rows)] if rows else []
+        if over > 0 and width is not None:
+            body = [_paragraph(heads, row, width) for row in rows]
         lines = [around[0], "", *body, *around[1:]]
         return "\n".join(lines) + "\n"
 
@@ -155,6 +161,15 @@ class Table:
             "rows": rows,
             "notes": list(self.notes),
         }
+
+
+def _paragraph(heads: Sequence[str], row: Sequence[str], width: int) -> str:
+    """The first cell of a row, and below it the others with their headings."""
+    cells = zip(heads[1:], row[1:], strict=True)
+    text = "; ".join(f"{head}: {cell}" for head, cell in cells if cell)
+    indent = " " * 4
+    below = fill(text, width, initial_indent=indent, subsequent_indent=indent, **_WHOLE)
+    return f"{row[0]}\n{below}"
 
 
 def _is_number(value) -> bool:
