@@ -115,6 +115,7 @@ from makebreak.gap.verdict import (
     tried,
     two_figures,
 )
+from makebreak.models.drives import TooStiff
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import (
     Effect,
@@ -993,7 +994,7 @@ def _settle_step(
         coarse_model = WindowModel(scene, recordings, WINDOW_SEC, most=most)
         fine_model = copy(coarse_model)  # Of the same windows.
         fine_model.scene, fine_model.simulation = fine, SceneSimulation(fine)
-    except (DoesNotFit, ValueError):  # Drives too stiff for a continuous plant.
+    except (DoesNotFit, TooStiff):  # For a continuous plant, that is.
         return scene, []
     both = [partial(m.simulate, ()) for m in (coarse_model, fine_model)]
     a, b = side_by_side(both, jobs)

@@ -191,11 +191,15 @@ def _gear(plant: MultibodyPlant, model: str) -> Gear:
     return Gear(n_q + at, slow, 2.0 * dt * mobility[at])
 
 
+class TooStiff(ValueError):
+    """A drive stops its joint faster than can be simulated."""
+
+
 def check_stiffness(
     mobility: float, damping: float, joint: str, time_step: float = 0.0
 ) -> None:
-    """Raises: ValueError if a drive stops its joint faster than can be simulated, as it
-    does if the model lacks the motor's rotor.
+    """Raises: TooStiff if the drive is, as it may be where the model lacks the motor's
+    rotor.
 
     Args: mobility: of the joint where it is [1/(kg m2)]. time_step: of Drake's own
         steps [s]; 0: it has none.
@@ -203,7 +207,7 @@ def check_stiffness(
     inertia = 1.0 / mobility
     least = damping * time_step if time_step else 0.5 * damping / FASTEST
     if inertia < least:
-        raise ValueError(
+        raise TooStiff(
             f"actuation: the drive of {joint} damps with {damping:.3g} N m s/rad, and "
             f"the joint has {inertia:.2g} kg m2, too little for that to be simulated "
             f"(expected {least:.2g} or more): give it its rotor (an effect "

@@ -24,6 +24,7 @@ from makebreak.gap.simulation import driven_arm
 from makebreak.gap.simulation.commands import Commands
 from makebreak.gap.simulation.driven_arm import DrivenArmSimulation
 from makebreak.gap.workflow import other_problem, problem_for, run_gap
+from makebreak.models.drives import TooStiff
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import ActuationSection, read_scene
@@ -453,13 +454,17 @@ def test_a_drive_that_its_tolerance_makes_too_stiff_is_judged_as_it_came(
     def measure(scene, *rest):
         judged.append(scene)
         if scene is not came:
-            raise ValueError("too little for that to be simulated")
+            raise kind("too little for that to be simulated")
         return None
 
     monkeypatch.setattr(mechanism, "measure", measure)
     monkeypatch.setattr(mechanism, "with_moved_gains", lambda scene, *_: replace(scene))
+    kind: type[ValueError] = TooStiff
     outcome = problem.outcome([], selection.start, selection.start, n)
     assert outcome is None and judged[-1] is came and len(judged) == 2
+    kind = ValueError  # Anything else is no drive, and not hidden.
+    with pytest.raises(ValueError, match="too little for that"):
+        problem.outcome([], selection.start, selection.start, n)
 
 
 def test_what_is_left_at_rest_may_be_friction_where_no_law_says_what_holds(

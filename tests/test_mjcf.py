@@ -228,8 +228,11 @@ def test_a_gear_is_applied_to_commands_of_effort_and_said(tmp_path):
 def test_gains_of_a_files_servos_become_the_drives(tmp_path):
     names = ["j1_pos", "j2_pos", "j1_position_command", "j2_position_command"]
     scene = proposed(tmp_path, FILES["servos"], names).scene
-    assert "kp: [40.0, 30.0]" in scene and "kd: [2.0, 1.0]" in scene
+    assert "kp: [40.0, 30.0]  # [N m/rad]" in scene and "kd: [2.0, 1.0]" in scene
     assert "guess" not in scene
+    slide = FILES["servos"].replace("name='j2'", "name='j2' type='slide'")
+    scene = proposed(tmp_path, slide, names).scene
+    assert "# [N m/rad or N/m]" in scene and "# [N m s/rad or N s/m]" in scene
 
 
 def test_ctrl_is_what_the_files_own_actuator_takes(tmp_path):

@@ -520,6 +520,7 @@ def test_a_servo_is_proposed_with_the_stiffness_that_its_sag_tells(tmp_path):
     (tmp_path / "scene.yaml").write_text(proposal.scene)
     scene = read_scene(tmp_path / "scene.yaml")
     assert scene.actuation.type == "servo"
+    assert "# [N m/rad], " in proposal.scene and "# [N m s/rad], " in proposal.scene
     np.testing.assert_allclose(scene.actuation.kp, 6.0, rtol=0.01)
     SceneSimulation(scene)  # It can be simulated.
 
@@ -564,6 +565,7 @@ def test_a_servo_is_proposed_with_the_gains_that_its_motion_tells(
     np.testing.assert_allclose(scene.actuation.kd, kd, rtol=0.02)
     assert not scene.effects  # No rotor that is not there.
     assert scene.tolerance == {"drive_gains": 0.05} and not proposal.findings()
+    assert "# [N/m], " in proposal.scene and "# [N s/m], " in proposal.scene
     assert scene.actuation.limit == [taken]
 
 

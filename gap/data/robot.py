@@ -69,7 +69,7 @@ from makebreak.gap.data.table import (
 from makebreak.gap.data.units import DEG, FULL_RANGE, in_units, said_of_units
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.joints import ROTOR
-from makebreak.models.effects.kind import actuator_of, one_dof_joints
+from makebreak.models.effects.kind import actuator_of, one_dof_joints, unit_at
 from makebreak.models.fixed_joints import couplings_in, fix_joints, followers_in
 from makebreak.models.model_files import checked_inertias, without_lost_collisions
 from makebreak.models.model_inertias import ModelText, mended
@@ -983,13 +983,14 @@ def _actuation(judged: Judged, kinds, logs, notes: list[str]) -> tuple[list[str]
         every_one = all(joint in gains for joint in joints)
         by_motion = FROM_EFFORTS if servos else FROM_MOTION
         told = by_motion if every_one else FROM_SAG if known else "a guess"
-        notes.append(f"drives are position servos of kp {kp} N m/rad ({told})")
+        of_kp, of_kd = _units(robot, joints)
+        notes.append(f"drives are position servos of kp {kp} {of_kp} ({told})")
         lines = [
             "actuation:",
             "  type: servo  # Gains are guessed: correct them.",
             f"  joints: [{', '.join(joints)}]",
-            f"  kp: {kp}  # [N m/rad], {told}.",
-            f"  kd: {kd}  # [N m s/rad], {by_motion if every_one else 'a guess'}.",
+            f"  kp: {kp}  # [{of_kp}], {told}.",
+            f"  kd: {kd}  # [{of_kd}], {by_motion if every_one else 'a guess'}.",
         ]
         limits = {j: robot.effort_limits.get(j, np.inf) for j in joints}
         most = {j: max(gains[j].most if j in gains else 0.0, judged.most.get(j, 0.0))
@@ -999,6 +1000,7 @@ def _actuation(judged: Judged, kinds, logs, notes: list[str]) -> tuple[list[str]
             lines.append(f"tolerance: {{drive_gains: {GAINS_KNOWN_TO}}}")
         # A geared motor's own inertia is what its back-EMF and its spring work on.
         rotors, moved = [], _inertia(robot)
+        slides = {j.name: j.prismatic for j in robot.joints}
         for joint, k in zip(joints, kd, strict=True):
             inertia = gains[joint].rotor if joint in gains else ROTOR_SEC * k
             own = (ROTOR, [joint.partition(".")[2]])
@@ -1007,7 +1009,8 @@ def _actuation(judged: Judged, kinds, logs, notes: list[str]) -> tuple[list[str]
             if joint not in gains or inertia > LEAST_ROTOR * moved[joint]:
                 rotors.append(
                     f"- {{kind: rotor_inertia, at: {joint}, "
-                    f"parameters: {{inertia: {float(f'{inertia:.2g}')}}}}}  # [kg m2]"
+                    f"parameters: {{inertia: {float(f'{inertia:.2g}')}}}}}  "
+                    f"# [{unit_at('kg m2', slides[joint])}]"
                 )
         if rotors:
             lines += ["effects:  # Rotors of the servos' motors, a guess.", *rotors]
@@ -1020,7 +1023,7 @@ def _actuation(judged: Judged, kinds, logs, notes: list[str]) -> tuple[list[str]
             "actuation:",
             "  type: velocity  # The gains are guessed: correct them.",
             f"  joints: [{', '.join(joints)}]",
-            f"  kd: {kd}  # [N m s/rad], or [N s/m] of one that slides.",
+            f"  kd: {kd}  # [{_units(robot, joints)[1]}].",
         ], "a guess"
     notes.append(
         "the log has no command and no effort, so no torque acts on the joints"
@@ -1031,12 +1034,22 @@ def _actuation(judged: Judged, kinds, logs, notes: list[str]) -> tuple[list[str]
 def _servos_of_file(robot: Robot, joints, drives, notes: list[str]) -> list[str]:
     """Lines of position servos whose gains are in the file."""
     notes.append(f"drives are the position servos of {robot.path.name}")
+    of_kp, of_kd = _units(robot, joints)
     return [
         "actuation:",
         "  type: servo  # From the file.",
         f"  joints: [{', '.join(joints)}]",
-        f"  kp: {[float(drives[j].kp) for j in joints]}  # [N m/rad]",
-        f"  kd: {[float(drives[j].kd) for j in joints]}  # [N m s/rad]",
+        f"  kp: {[float(drives[j].kp) for j in joints]}  # [{of_kp}]",
+        f"  kd: {[float(drives[j].kd) for j in joints]}  # [{of_kd}]",
+    ]
+
+
+def _units(robot: Robot, joints: Sequence[str]) -> list[str]:
+    """Of kp and kd, both units where some of the joints turn and some slide."""
+    slides = dict.fromkeys(j.prismatic for j in robot.joints if j.name in joints)
+    return [
+        " or ".join(unit_at(unit, each) for each in slides)
+        for unit in ("N m/rad", "N m s/rad")
     ]
 
 

@@ -52,7 +52,7 @@ def with_moved_gains(scene: Scene, names: Sequence[str], values) -> Scene:
         more_kp, more_kd = (
             float(found.get(gain_name(joint, gain), 0.0)) for gain in ("kp", "kd")
         )
-        kp.append(float(law.kp) * (1.0 + more_kp))
+        kp.append(max(float(law.kp) * (1.0 + more_kp), 0.0))
         more = more_kd * float(law.kd + law.emf)
         kd.append(max(float(law.kd) + more, 0.0))
     return replace(scene, actuation=replace(actuation, kp=kp, kd=kd))

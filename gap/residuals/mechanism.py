@@ -60,6 +60,7 @@ from makebreak.gap.thresholds import (
     SIMULATED_RIVAL_GAIN,
     UNEXPLAINED_RMS,
 )
+from makebreak.models.drives import TooStiff
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.joints import ROTOR, rotor
@@ -905,7 +906,7 @@ class MechanismProblem(InverseModel, GapProblem):
             )  # fmt: skip
             try:
                 return measure(scene, *rest)
-            except ValueError:  # A drive that its nuisances would make too stiff.
+            except TooStiff:  # As its nuisances would make it.
                 return measure(self.scene, *rest)
 
         measured = measured_with(slow)
