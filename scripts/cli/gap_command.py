@@ -401,7 +401,8 @@ def effects_table(result: GapResult, told: str = "") -> Table:
             "in the equations of motion of the same data: {:.3g} before, {:.3g} "
             "after".format(*g.in_equations)
         )
-    columns = ("effect", "at", "parameters", "next best")
+    columns = ["effect", "at", "parameters", "next best"]
     if not any(row[2] for row in rows):
-        columns, rows = ("effect", "at", "next best"), [r[:2] + r[3:] for r in rows]
+        columns.remove("parameters")
+        rows = [row[:2] + row[3:] for row in rows]
     return Table("\n".join(summary_lines(result)), columns, rows, notes=notes)

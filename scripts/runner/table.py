@@ -3,6 +3,7 @@
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import zip_longest
 from textwrap import fill, wrap
 
@@ -13,7 +14,8 @@ import numpy as np
 _NAN = re.compile(r"(?<![\w.\"'])nan(?![\w\"'])")
 
 _NARROW = 8  # Characters of a heading that is not broken.
-_WHOLE = {"break_long_words": False, "break_on_hyphens": False}  # Names can be copied.
+# Breaks no name, so that it can be copied.
+_fill = partial(fill, break_long_words=False, break_on_hyphens=False)
 
 
 @dataclass(frozen=True)
@@ -114,7 +116,7 @@ class Table:
 
         rule = "  ".join("-" * w for w in widths)
         around = [
-            each if width is None else fill(each, width, **_WHOLE)
+            each if width is None else _fill(each, width)
             for each in (self.title, *self.notes)
         ]
         body = [line(heads), rule, *map(line, rows)] if rows else []
@@ -168,7 +170,7 @@ def _paragraph(heads: Sequence[str], row: Sequence[str], width: int) -> str:
     cells = zip(heads[1:], row[1:], strict=True)
     text = "; ".join(f"{head}: {cell}" for head, cell in cells if cell)
     indent = " " * 4
-    below = fill(text, width, initial_indent=indent, subsequent_indent=indent, **_WHOLE)
+    below = _fill(text, width, initial_indent=indent, subsequent_indent=indent)
     return f"{row[0]}\n{below}"
 
 
