@@ -18,6 +18,7 @@ from makebreak.systems.baselines.dynamics_residual_learner import (
 )
 from makebreak.systems.contact_mpc.lcs_plant import LcsPlant
 from makebreak.systems.contact_mpc.numerics import residual_learner as numerics
+from makebreak.systems.contact_mpc.numerics.lcp import solve_lcp
 from makebreak.systems.contact_mpc.numerics.lcs import LCS, simulate
 from makebreak.systems.contact_mpc.numerics.residual_learner import (
     empty_buffer,
@@ -136,7 +137,26 @@ def test_loss_is_the_minimum_that_a_bounded_least_squares_solver_finds(seed):
     np.testing.assert_allclose([*lam[0], *eta[0]], solution, atol=1e-5 * scale)
 
 
-def test_active_set_and_lemke_find_the_same_exact_solution():
+def lemke_of(P, p, F, b, gamma):
+    """lam and eta of solve_step from the LCP of the QP's optimality conditions."""
+    n, identity = b.size, np.eye(b.size)
+    hessian = np.block(
+        [
+            [P + F.T @ F / gamma, identity - F.T / gamma],
+            [identity - F / gamma, identity / gamma],
+        ]
+    )
+    solution = solve_lcp(hessian, np.concatenate([p + F.T @ b / gamma, -b / gamma]))
+    return solution[:n], solution[n:]
+
+
+@pytest.mark.parametrize("at_once", [numerics.AT_ONCE, -1000])
+def test_active_set_and_lemke_find_the_same_exact_solution(at_once, monkeypatch):
+    """Also where it changes one entry at a time from the start."""
+    monkeypatch.setattr(numerics, "AT_ONCE", at_once)
+    solve_step = numerics.solve_step
+    if at_once < 0:
+        solve_step = solve_step.py_func  # Compiled code keeps the constant.
     rng = np.random.default_rng(0)
     for _ in range(300):
         lcs, x, u, x_next = random_problem(rng, n_contacts=int(rng.integers(1, 4)))
@@ -145,10 +165,9 @@ def test_active_set_and_lemke_find_the_same_exact_solution():
         step = measured_step(lcs, x, u, x_next, Q_d, eps)
         # A copy of q, as the learner has: what may be written is compiled by itself.
         problem = (step.P[0], step.p[0], step.F[0], step.q[0].copy(), 5e-4)
-        ours = numerics.solve_step(*problem)
-        lemke = numerics._solve_step_by_lemke(*problem)
-        assert ours[0] and lemke[0]
-        for a, b in zip(ours[2:], lemke[2:], strict=True):
+        ours = solve_step(*problem)
+        assert ours[0]
+        for a, b in zip(ours[2:4], lemke_of(*problem), strict=True):
             # Both solve the same equations for the free entries: equal to rounding
             # times the condition number of F + F' - gamma, at most 1e4.
             np.testing.assert_allclose(a, b, atol=1e-10 * (1e-3 + abs(b).max()))

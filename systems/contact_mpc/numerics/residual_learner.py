@@ -29,13 +29,13 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numba import njit
 
-from makebreak.systems.contact_mpc.numerics.lcp import SOLVED as LCP_SOLVED
-from makebreak.systems.contact_mpc.numerics.lcp import solve_lcp_kernel
 from makebreak.systems.contact_mpc.numerics.lcs import LCS, opening_speed
 
 # Gradients (times eps) below this are round-off, and Adam would follow even those [N].
 FORCE_FLOOR = 1e-9
 ADAM_EPSILON = 1e-8  # Keeps Adam's quotient finite [N].
+AT_ONCE = 20  # Rounds of the active set, and four more an entry, before single changes.
+ROUNDING = 1e-9  # Of the largest entry.
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,58 +238,55 @@ def _adam(P, p, F, q, constant, group, state, eps, gamma, rate, n_steps, r_max, 
 def solve_step(P, p, F, b, gamma):
     """min over lam, eta >= 0: 1/2 lam'P lam + p'lam + lam'eta + |b + F lam - eta|^2/2g.
 
-    A primal-dual active set on which entries of lam and eta are free; it ends when the
-    free sets repeat, which is the exact solution. It hardly ever fails to end; then
-    Lemke's method on the same QP, which always does, says which entries are free.
+    A primal-dual active set on which entries of lam and eta are free: all that are on
+    the wrong side change at once, until none is, which is the exact solution. Should
+    that cycle, as it hardly ever does, one changes at a time, the first that is wrong
+    by more than rounding, which always ends.
 
     Returns: solved, cost, lam, eta, force = (b + F lam - eta)/gamma.
+    Source: of one at a time: Murty, "Note on a Bard-type scheme for solving the
+    complementarity problem", Opsearch 11 (1974).
     """
     n = b.size
     contact, gap = b <= 0.0, b > 0.0  # Where lam, eta are free.
     lam, eta, force, slope = _solve_free(P, p, F, b, gamma, contact, gap)
-    for _ in range(4 * n + 20):
-        changed = False
+    below_lam = below_eta = below_slope = 0.0
+    for k in range(100 * (n + 1)):
+        changed, is_single = False, k >= 4 * n + AT_ONCE
+        if is_single:
+            below_lam = ROUNDING * np.abs(lam).max()
+            below_eta = ROUNDING * (np.abs(b).max() + np.abs(eta).max())
+            below_slope = ROUNDING * (_largest_slope(p, F, b, gamma, slope))
         for i in range(n):
-            now = lam[i] > 0.0 if contact[i] else slope[i] < 0.0
+            now = lam[i] > -below_lam if contact[i] else slope[i] < -below_slope
             if now != contact[i]:
                 contact[i], changed = now, True
-            now = eta[i] > 0.0 if gap[i] else force[i] > lam[i]
+                if is_single:
+                    break
+            now = (
+                eta[i] > -below_eta if gap[i] else force[i] - lam[i] > below_eta / gamma
+            )
             if now != gap[i]:
                 gap[i], changed = now, True
+                if is_single:
+                    break
         if not changed:
+            lam, eta = np.maximum(lam, 0.0), np.maximum(eta, 0.0)
             return True, _cost(P, p, lam, eta, force, gamma), lam, eta, force
         lam, eta, force, slope = _solve_free(P, p, F, b, gamma, contact, gap)
-    return _solve_step_by_lemke(P, p, F, b, gamma)
+    return False, np.nan, lam, eta, force
 
 
 @njit(cache=True)
-def _solve_step_by_lemke(P, p, F, b, gamma):
-    """solve_step as the LCP of the QP's optimality conditions in (lam, eta)."""
-    n = b.size
-    hessian, linear = np.empty((2 * n, 2 * n)), np.empty(2 * n)
-    transposed = np.ascontiguousarray(F.T)
-    identity = np.eye(n)
-    hessian[:n, :n] = P + transposed @ F / gamma
-    hessian[:n, n:] = identity - transposed / gamma
-    hessian[n:, :n] = identity - F / gamma
-    hessian[n:, n:] = identity / gamma
-    linear[:n] = p + transposed @ b / gamma
-    linear[n:] = -b / gamma
-    solution, status = solve_lcp_kernel(hessian, linear)
-    contact, gap = solution[:n] > 0.0, solution[n:] > 0.0
-    lam, eta, force, slope = _solve_free(P, p, F, b, gamma, contact, gap)
-    # Entries that are zero to rounding may be on the wrong side of it, not further.
-    scale_lam = 1e-9 * np.abs(lam).max()
-    scale_eta = 1e-9 * (np.abs(b).max() + np.abs(eta).max())
-    scale_slope = 1e-9 * (np.abs(linear[:n]).max() + np.abs(slope).max())
-    solved = status == LCP_SOLVED
-    for i in range(n):
-        solved = solved and lam[i] >= -scale_lam and eta[i] >= -scale_eta
-        solved = solved and slope[i] >= -scale_slope
-        solved = solved and gamma * (force[i] - lam[i]) <= scale_eta
-        solved = solved and np.isfinite(lam[i])
-        lam[i], eta[i] = max(lam[i], 0.0), max(eta[i], 0.0)
-    return solved, _cost(P, p, lam, eta, force, gamma), lam, eta, force
+def _largest_slope(p, F, b, gamma, slope):
+    """Of the cost in lam, here and with all entries closed."""
+    largest = np.abs(slope).max()
+    for i in range(p.size):
+        closed = p[i]
+        for j in range(p.size):
+            closed += F[j, i] * b[j] / gamma
+        largest = max(largest, abs(closed))
+    return largest
 
 
 @njit(cache=True)
