@@ -106,7 +106,7 @@ def solve_lcp_kernel(F, q):
             status, best = NOT_PRECISE, _violation(M, b, z)
             found[:] = z
             if not best < 1e-9:
-                _solve_small(M, b, basic, found)
+                _solve_small(M, b, basic, rebuild, found)
                 best = _violation(M, b, found)
             if best < 1e-9:
                 break
@@ -117,13 +117,13 @@ def solve_lcp_kernel(F, q):
     # positive semi-definite, and rounding may break it where it nearly is not: hence
     # the search. Where that finds nothing either, a more regular F and 1e-7 have to do.
     if not best < 1e-9:
-        if not (
-            _regular(M, b, 1e-12, 0, z) < 1e-9
-            or _search(M, b, z)
-            or _regular(M, b, 1e-8, REBUILD, z) < 1e-7
-        ):
+        for more, rebuild, most in ((1e-12, 0, 1e-9), (1e-8, REBUILD, 1e-7)):
+            if _regular(M, b, more, rebuild, found) < most:
+                break
+            if rebuild == 0 and _search(M, b, found):
+                break
+        else:
             return lam, status
-        found = z
     for i in range(n):
         lam[i] = scale[i] * largest * found[i]
     return lam, SOLVED
@@ -172,7 +172,7 @@ def _units(F):
 
 
 @njit(cache=True)
-def _solve_small(M, b, basic, z):
+def _solve_small(M, b, basic, rebuild, z):
     """Solves what is below SMALL in the solution z (n,) once more, in a unit of its
     own, with the other contacts as they are in `basic` (n,); overwrites both."""
     n = b.size
@@ -189,7 +189,7 @@ def _solve_small(M, b, basic, z):
         for j in range(rows.size):
             S[i, j] = -T[rows[i], others[j]]
     unit = np.abs(s).max()
-    y, status, _ = _lemke(S, s / unit, 1e-11, 0)
+    y, status, _ = _lemke(S, s / unit, 1e-11, rebuild)
     value = T[:, 2 * n + 1] - T[:, others] @ (unit * y)
     z[:] = 0.0
     for k in range(n):
@@ -251,9 +251,9 @@ def _lemke(M, b, tolerance, rebuild):
     _fill(T, M, b)
     # z0 enters for the most negative b; of equal ones the last, which is the
     # lexicographically smallest row of [b, I].
-    row = 0
-    for i in range(1, n):
-        if b[i] <= b[row]:
+    row = n - 1  # Literal integers would each compile what they are passed to.
+    for i in range(n - 2, -1, -1):
+        if b[i] < b[row]:
             row = i
     z = np.zeros(n)
     entering = z0
@@ -300,7 +300,7 @@ def _rebuild(T, M, b, basic):
     for k in range(n):  # columns[k:] are left, and the rows whose basic is -1.
         basic[k] = -1
     for k in range(n):
-        largest, row, at = 1e-14, -1, -1
+        largest, row, at = 1e-14, -n, -n
         for j in range(k, n):
             for i in range(n):
                 if basic[i] < 0 and abs(T[i, columns[j]]) > largest:
