@@ -337,6 +337,20 @@ def _compared(
         searched.undone[:] = own.undone
         return other, then, named
 
+    def by_evidence() -> tuple[GapProblem, Selection, GapResult]:
+        """Where equations agree, by nuisances that many have to be moved for or as
+        noise of light joints is large, and simulated windows do not: what there is
+        evidence for is taken."""
+        first = problem, selection, result
+        problem.plan = replace(problem.plan, counts_evidence=True)
+        say("searching the catalogue by evidence")
+        then = select(problem, say)
+        if not then.choices:
+            return first
+        with budget.part(CONCLUDE):
+            named = conclude(problem, then, reported, checks, jobs)
+        return (problem, then, named) if named.gap.after < result.gap.after else first
+
     def with_creep() -> tuple[GapProblem, Selection, GapResult]:
         """Where friction holds softly: what creeps is no slip."""
         pressing = isinstance(problem, PressingProblem)
@@ -367,6 +381,12 @@ def _compared(
         return with_differences(result, Together(problem, selection), alone)
 
     again: ProblemOf = partial(problem_for, meets=meets)
+    if isinstance(problem, MechanismProblem) and (
+        result.gap.window_s > 0.0 and result.gap.after > AGREEMENT_RMS_MAX
+    ):
+        what, now = "searching by evidence", (problem, selection, result)
+        problem, selection, result = budget.if_time(what, by_evidence, now)
+        seconds["evidence"] = clock.lap()
     touching = isinstance(problem, ContactProblem)
     if result.verdict == "gap_unnamed" and touching:
         what, now = "comparing with contacts that creep", (problem, selection, result)

@@ -778,6 +778,32 @@ def test_efforts_tell_gains_beside_late_commands_and_another_zero(known, late):
     np.testing.assert_allclose([g.kd for g in found], 2.0, rtol=1e-2)
 
 
+@pytest.mark.parametrize("rows_late", [0, 2])
+def test_efforts_of_a_stiff_loop_tell_gains_where_each_row_has_a_new_command(rows_late):
+    """Rows of 10 ms, in which a loop of 1 ms is done with a step of its command, as
+    policies of learned robots have them; of rates that are measured."""
+    kp, kd, rows = 1600.0, 56.0, []
+    q = v = 0.0
+    commands = 0.4 * np.sin(0.02 * np.arange(2000)) + 0.2 * np.sin(
+        0.051 * np.arange(2000)
+    )
+    for k, now in enumerate(commands):
+        acts = commands[max(k - rows_late, 0)]
+        for step in range(10):
+            effort = kp * (acts - q) - kd * v
+            if step == 0:
+                rows.append((0.01 * k, q, now, effort, v))
+            v += 1e-3 * effort
+            q += 1e-3 * v
+    t, *columns = np.array(rows).T
+    log = ServoLog(t, *(x[:, None] for x in columns))
+    (found,) = gains_of_efforts([log], [None])
+    assert (found.kp, found.kd) == (pytest.approx(kp), pytest.approx(kd))
+    # Means over rows fit as well, with gains that are a tenth off or more.
+    (by_means,) = gains_of_efforts([replace(log, velocity=None)], [None])
+    assert by_means.kp != pytest.approx(kp, rel=0.05)
+
+
 def test_without_efforts_no_joint_has_gains_by_them():
     """None of each joint, also where one of two logs has none."""
     t = 0.01 * np.arange(400)

@@ -1128,15 +1128,16 @@ def _motions(robot: Robot, every, logs) -> list[ServoLog]:
         time = channels["time"]
         q = np.stack([channels[f"{j.name}.position"] for j in robot.joints], axis=1)
         none = np.full(len(time), np.nan)
-        told, effort = (
+        told, effort, v = (
             np.stack([read(channels.get(f"{j.name}.{what}", none))
                       for j in robot.joints], axis=1)
             for what, read in (("position_command", _held),
-                               ("effort_measured", np.asarray))
+                               ("effort_measured", np.asarray),
+                               ("velocity", np.asarray))
         )  # fmt: skip
         good = np.isfinite(q).all(axis=1) & np.isfinite(time)
         good &= np.diff(time, prepend=-np.inf) > 0.0
-        motions.append(ServoLog(time[good], q[good], told[good], effort[good]))
+        motions.append(ServoLog(time[good], q[good], told[good], effort[good], v[good]))
     return motions
 
 

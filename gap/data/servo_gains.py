@@ -8,6 +8,7 @@ free, so that neither is taken for a gain.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
@@ -49,12 +50,14 @@ class ServoGains:
 @dataclass(frozen=True, eq=False)
 class ServoLog:
     """One log: time (n,) [s], positions q (n, n_q) and position commands (n, n_q), NaN
-    where there is none, as each is held from its row on. effort: (n, n_q) measured."""
+    where there is none, as each is held from its row on. effort, velocity: (n, n_q)
+    measured."""
 
     time: np.ndarray
     q: np.ndarray
     command: np.ndarray
     effort: np.ndarray | None = None
+    velocity: np.ndarray | None = None
 
 
 def servo_gains(
@@ -95,20 +98,30 @@ def gains_of_efforts(
 
     Args: known: kp and kd of the robot's file: they are taken where they fit as well.
     """
-    logs = [
-        (motion, averaged) for motion in motions
-        if motion.effort is not None and (averaged := averaged_motion(motion))
-    ]  # fmt: skip
-    if not logs or len(logs) < len(motions) or not known:
-        return [None] * len(known)
+    found: list[ServoGains | None] = [None] * len(known)
+    averaged = [averaged_motion(motion) for motion in motions]
+    steps = [each[1] for each in averaged if each is not None]
+    efforts = [motion.effort is not None for motion in motions]
+    if not (known and motions and all(efforts) and len(steps) == len(motions)):
+        return found
+    # By rows, where these tell it: means over rows are of something else (below).
+    if all(motion.velocity is not None for motion in motions):
+        rows = [partial(_law_of_rows, motion) for motion in motions]
+        found = _laws_of(rows, known, min(steps), NOTHING)
+    if not all(found):
+        rows = [partial(_law_rows, *each)
+                for each in zip(motions, averaged, strict=True)]  # fmt: skip
+        found = _laws_of(rows, known, min(steps), BENT)
+    return found
+
+
+def _laws_of(rows_of, known, step: float, least: float) -> list[ServoGains | None]:
+    """The laws from what gives, of each log, each joint's rows for commands that are so
+    late [s]; shares of a variance that are smaller than `least` are as good."""
 
     def laws(late: float) -> list[tuple[float, ServoGains | None]]:
-        parts: list[list] = [[] for _ in known]
-        for motion, averaged in logs:
-            rows = _law_rows(motion, averaged, late)
-            for own, some in zip(parts, rows, strict=True):
-                own.append(some)
-        return [_law(*each) for each in zip(parts, known, strict=True)]
+        each = zip(*(rows(late) for rows in rows_of), strict=True)
+        return [_law(*one) for one in zip(each, known, strict=True)]
 
     def cost(late: float) -> float:
         return sum(float(np.log(left)) for left, _ in laws(late))
@@ -116,21 +129,36 @@ def gains_of_efforts(
     now = [gains for _, gains in laws(0.0)]
     if all(g and k and g.kp == k[0] for g, k in zip(now, known, strict=True)):
         return now  # As the file has them.
-    step = min(averaged[1] for _, averaged in logs)
     some = np.arange(0.0, MOST_LATE, step)
     costs = [cost(late) for late in some]
     k = int(np.argmin(costs))
     most = len(known) * np.log(LATE_LEAVES)
-    if not costs[0] - max(costs[k], len(known) * np.log(BENT)) > most:
+    if not costs[0] - max(costs[k], len(known) * np.log(least)) > most:
         return now
     around = (some[k] - step, some[k] + step)
-    late = float(minimize_scalar(cost, bounds=around, method="bounded").x)
+    found = minimize_scalar(cost, bounds=around, method="bounded")
+    # Where commands hold from row to row it is a whole number of these.
+    late = float(found.x) if found.fun < costs[k] else float(some[k])
     return [gains for _, gains in laws(late)]
 
 
+def _law_of_rows(motion: ServoLog, late: float):
+    """As _law_rows, of efforts and velocities that are of the instants of their rows:
+    between two of these a stiff loop has done most of what a step of its command makes
+    it do, so that means over rows are of something else."""
+    assert motion.effort is not None and motion.velocity is not None
+    t = motion.time
+    rows = t - late >= t[0]
+    for told, q, v, effort in zip(
+        motion.command.T, motion.q.T, motion.velocity.T, motion.effort.T, strict=True
+    ):
+        error = np.interp(t - late, t, told) - q
+        yield np.column_stack([error, -v])[rows], effort[rows]
+
+
 def _law_rows(motion: ServoLog, averaged, late: float):
-    """Of each joint error and rates (m, 3), and effort (m,), of commands that act so
-    late [s]."""
+    """Of each joint error and rates (m, 3), the row before's and the one's after, and
+    effort (m,), of commands that act so late [s]."""
     even, step, _, (kernel, *_), (mean, rate, rate2) = averaged
     assert motion.effort is not None
     for i in range(mean.shape[1]):
@@ -148,7 +176,7 @@ def _law(
     parts: Sequence[tuple[np.ndarray, np.ndarray]], known
 ) -> tuple[float, ServoGains | None]:
     """The share of its effort's variance that a law leaves, and the law. From error and
-    rates (m, 3), and effort (m,), of each log."""
+    one rate or two (m, 2 or 3), and effort (m,), of each log."""
     X, y = (np.concatenate(each) for each in zip(*parts, strict=True))
     if not (np.isfinite(X).all() and np.isfinite(y).all() and np.ptp(y) > 0.0):
         return 1.0, None
@@ -156,7 +184,7 @@ def _law(
     whole = float(y @ y)
     if known is not None:
         kp, kd = known
-        other = kd * (X[:, 2] - X[:, 1])  # Of so much of its rate the row after.
+        other = kd * (X[:, -1] - X[:, 1])  # Of so much of its rate the row after.
         rest = y - kp * X[:, 0] - kd * X[:, 1]
         share = np.clip(rest @ other / max(other @ other, 1e-300), 0.0, 1.0)
         left = float(np.sum((rest - share * other) ** 2))

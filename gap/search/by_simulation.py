@@ -60,8 +60,8 @@ def _as_far_as_it_helps(
             r = search.problem.residual([*(e.effect for e in chosen), *effects])
         except (ValueError, RuntimeError):  # The scene cannot have it.
             break
-        fit, left = screen.evaluate(r), screen.fit_nuisances(r)[1]
-        evidence = search.evidence_against(left, fit, current, each.candidate.size)
+        fit, (b, left) = screen.evaluate(r), screen.fit_nuisances(r)
+        evidence = search.evidence_against(b, left, fit, current, each.candidate.size)
         if not evidence > most:
             break
         fit = replace(each.fit, score=fit.score, held_out=fit.held_out, train=fit.train)

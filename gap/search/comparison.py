@@ -116,11 +116,13 @@ class Comparison:
     def may_need_more(self, fitted: Fitted) -> bool:
         """The same, or one channel is above what an effect of it alone must be beyond,
         where models can be compared by evidence. Where nothing but evidence says it,
-        candidates are asked, unless the scene as it came was above the noise."""
+        candidates are asked; where errors jump unless the scene as it came was above
+        the noise."""
         if self.needs_more(fitted):
             return True
         if self.plan.counts_evidence:
-            return not (fitted.effects and self.needs_more(self.start))
+            above = fitted.effects and self.plan.jumps and self.needs_more(self.start)
+            return not above
         if not self.tells_by_evidence or not self.plan.by_channel:
             return False
         noisy = self.problem.in_noise(fitted.left)
@@ -130,9 +132,10 @@ class Comparison:
     def is_needed(self, more: Fitted, fitted: Fitted, parameters: int) -> bool:
         """Whether what a fit has more than another is missing there: an effect is, or
         all rows together are near the noise and it is there beyond doubt."""
+        asked = self.plan.counts_evidence and not self.plan.jumps
+        least = EVIDENCE_MIN if asked else BESIDE_NOISE_EVIDENCE
         return (
-            self.needs_more(fitted)
-            or self.evidence(more, fitted, parameters) > BESIDE_NOISE_EVIDENCE
+            self.needs_more(fitted) or self.evidence(more, fitted, parameters) > least
         )
 
     def is_strained(self, fitted: Fitted) -> bool:
@@ -256,10 +259,15 @@ class Comparison:
         """The same of columns (m, k) against none."""
         return self.evidence_by_columns(screen, X, X[:, :0])
 
-    def evidence_against(self, left, fit: LinearFit, other: Fitted, more: int) -> float:
-        """The same of what a model leaves of rows (m,), and its fit, over another."""
+    def evidence_against(
+        self, b, left, fit: LinearFit, other: Fitted, more: int
+    ) -> float:
+        """The same of a model's nuisances b (n_b,), what it leaves of rows (m,), and
+        its fit, over another."""
         least = min(fit.held_out, other.fit.held_out)
-        return self._evidence(left, other.left, least, more)
+        n = self.nuisances.prior
+        cost = [float(np.sum((x[: len(n)] / n) ** 2)) for x in (b, other.b)]
+        return self._evidence(left, other.left, least, more) + cost[1] - cost[0]
 
     def evidence_by_columns(self, screen: Screen, one, other) -> float:
         """The same of columns (m, k), beside others that a screen may have as further
