@@ -38,8 +38,9 @@ class SearchPlan:
         has.
     simulation_agrees: whether agreement also needs simulated windows that agree.
     loud: rms over noise of one channel that is a gap, whatever the others leave.
-    counts_evidence: whether rows are over the covariance that they have, and the law of
-        contact is that of the data, so that evidence counts below the noise, too.
+    counts_evidence: whether evidence counts below the noise, too: rows are over the
+        covariance that they have, and the law of contact is that of the data; or
+        simulations show a gap where rows agree.
     """
 
     evaluations: int = 8

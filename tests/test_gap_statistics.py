@@ -1169,13 +1169,17 @@ def test_a_friction_that_may_be_what_the_scene_has_is_not_named(
     assert _is_certain(search, [choice], None, 0) == named
 
 
-@pytest.mark.parametrize(("score", "named"), [(0.96, False), (0.94, True)])
-def test_what_evidence_takes_must_show_by_the_last_weights(score, named):
-    """Steps of another length are evidence for a damping, which takes nothing off."""
+@pytest.mark.parametrize(
+    ("score", "jumps", "named"),
+    [(0.96, True, False), (0.94, True, True), (0.96, False, True)],
+)
+def test_what_evidence_takes_must_show_by_the_last_weights(score, jumps, named):
+    """Where errors jump: steps of another length are evidence for a damping there,
+    which takes nothing off."""
     effect = Effect("joint_viscous_damping", ["a.j"], {"damping": 0.1})
     choice = Choice(effect, {"damping": 0.01}, 1.0, score, "", 1.0, (), (), 1)
     search = object.__new__(Comparison)
-    search.plan = SearchPlan(counts_evidence=True, least_gain=0.05)
+    search.plan = SearchPlan(counts_evidence=True, least_gain=0.05, jumps=jumps)
     search.start = SimpleNamespace(score=1.0)  # type: ignore[assignment]
     search.problem = SimpleNamespace(least=lambda kind, at: {})  # type: ignore[assignment]
     current = SimpleNamespace(score=score)
