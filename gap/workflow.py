@@ -381,9 +381,9 @@ def _compared(
         return with_differences(result, Together(problem, selection), alone)
 
     again: ProblemOf = partial(problem_for, meets=meets)
-    if isinstance(problem, MechanismProblem) and (
-        result.gap.window_s > 0.0 and result.gap.after > AGREEMENT_RMS_MAX
-    ):
+    in_equations = isinstance(problem, MechanismProblem)
+    simulated = result.gap.window_s > 0.0
+    if in_equations and simulated and result.gap.after > AGREEMENT_RMS_MAX:
         what, now = "searching by evidence", (problem, selection, result)
         problem, selection, result = budget.if_time(what, by_evidence, now)
         seconds["evidence"] = clock.lap()
