@@ -349,7 +349,7 @@ def _compared(
             return first
         with budget.part(CONCLUDE):
             named = conclude(problem, then, reported, checks, jobs)
-        return (problem, then, named) if named.gap.after < result.gap.after else first
+        return (problem, then, named) if _agrees(named.gap.after) else first
 
     def with_creep() -> tuple[GapProblem, Selection, GapResult]:
         """Where friction holds softly: what creeps is no slip."""
@@ -382,8 +382,8 @@ def _compared(
 
     again: ProblemOf = partial(problem_for, meets=meets)
     in_equations = isinstance(problem, MechanismProblem)
-    simulated = result.gap.window_s > 0.0
-    if in_equations and simulated and result.gap.after > AGREEMENT_RMS_MAX:
+    agrees = in_equations and _agrees(problem.error(selection.end))
+    if agrees and result.gap.window_s > 0.0 and not _agrees(result.gap.after):
         what, now = "searching by evidence", (problem, selection, result)
         problem, selection, result = budget.if_time(what, by_evidence, now)
         seconds["evidence"] = clock.lap()
@@ -406,6 +406,10 @@ def _compared(
         result = budget.if_time(what, one_by_one, result)
         seconds["recordings"] = clock.lap()
     return unless_doubtful(result).with_seconds(seconds)
+
+
+def _agrees(error: float) -> bool:
+    return error <= AGREEMENT_RMS_MAX
 
 
 def _conditioned(
