@@ -1,5 +1,6 @@
 """Measured efforts that are samples of a loop: no damping that is not there."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from makebreak.gap.workflow import run_gap
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.scene import ActuationSection
 from makebreak.models.scene_file import write_scene
+from makebreak.scripts.cli import main
 
 JOINTS = ["d.j1", "d.j2"]
 KP, KD, NOISE = np.array([200.0, 60.0]), np.array([12.0, 4.0]), 0.02
@@ -113,3 +115,54 @@ def test_of_efforts_alone_no_damping_is_named(tmp_path, step, share):
     assert share in SHARES
     (said,) = [f for f in result.checks if f.kind == "sampled_commands"]
     assert abs(said.size / 0.004 - share) < 0.16
+
+
+ARM = """<mujoco model="arm"><option timestep="0.002" integrator="implicitfast"/>
+<worldbody><body name="a" pos="0 0 .3"><joint name="j1" axis="0 0 1"/>
+<inertial mass="4" pos="0 .02 .1" diaginertia=".03 .03 .02"/>
+<body name="b" pos="0 0 .2"><joint name="j2" axis="0 1 0"/>
+<inertial mass="4" pos="0 0 .2" diaginertia=".06 .06 .01"/>
+<body name="c" pos="0 0 .4"><joint name="j3" axis="0 1 0"/>
+<inertial mass="2" pos=".01 0 .15" diaginertia=".02 .02 .005"/>
+<body name="d" pos="0 0 .3"><joint name="j4" axis="1 0 0"/>
+<inertial mass="1" pos="0 0 .1" diaginertia=".005 .005 .002"/>
+</body></body></body></body></worldbody></mujoco>"""
+
+
+def test_a_torque_constant_that_all_gains_and_masses_could_stand_for_is_named(tmp_path):
+    """Of one joint by a tenth: with all masses and the other drives' gains a few per
+    cent larger, each within its tolerance, equations agree. Nothing else is named."""
+    mujoco = pytest.importorskip("mujoco")
+    spec, rng = mujoco.MjSpec.from_string(ARM), np.random.default_rng(3)
+    for joint in list(spec.joints):
+        spec.add_actuator(name=joint.name, target=joint.name).trntype = 0
+    model = spec.compile()
+    data, rows = mujoco.MjData(model), []
+    kp, kd = np.array([400.0, 1600.0, 250.0, 13.0]), np.array([18.0, 70.0, 11.0, 0.6])
+    f, phase = rng.uniform(0.15, 0.45, (3, 4)), rng.uniform(0.0, 6.0, (3, 4))
+    size, middle = np.array([0.4, 0.25, 0.3, 0.3]), np.array([0.0, 0.3, 0.6, 0.2])
+    for k in range(9000):  # Each second step has a row, with a new command.
+        if k % 2 == 0:
+            told = middle + size * np.sum(np.sin(4e-3 * np.pi * f * k + phase), axis=0)
+        data.qpos[:] = told if k == 0 else data.qpos
+        data.ctrl[:] = kp * (told - data.qpos) - kd * data.qvel
+        if k % 2 == 0 and k >= 500:
+            rows.append([*data.qpos, *data.qvel, *data.ctrl, *told])
+        mujoco.mj_step(model, data)
+    q, v, u, told = np.array(rows).reshape(-1, 4, 4).transpose(1, 0, 2)
+    u = u * [1.0, 1.0, 1.1, 1.0]
+    q, v, u = (
+        x + std * rng.normal(size=x.shape)
+        for x, std in ((q, 2e-5), (v, 4e-4), (u, 0.003 * np.abs(u).max(axis=0)))
+    )
+    (tmp_path / "arm.xml").write_text(ARM)
+    time = 0.004 * np.arange(len(q))
+    np.savez(tmp_path / "log.npz", time=time, q=q, dq=v, tau=u, q_des=told)
+    out = tmp_path / "out"
+    paths = [str(tmp_path / name) for name in ("arm.xml", "log.npz")]
+    assert main(["gap", *paths, "--out", str(out)]) == 0
+    result = json.loads((out / "result.json").read_text())
+    (effect,) = result["effects"]
+    assert (effect["kind"], effect["at"]) == ("actuator_gain", ["arm.j3"])
+    gain = effect["parameters"]["gain"]
+    assert abs(gain["value"] - 1.0 / 1.1) < 2.0 * gain["std"] < 0.08
