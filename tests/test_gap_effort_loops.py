@@ -163,6 +163,6 @@ def test_a_torque_constant_that_all_gains_and_masses_could_stand_for_is_named(tm
     assert main(["gap", *paths, "--out", str(out)]) == 0
     result = json.loads((out / "result.json").read_text())
     (effect,) = result["effects"]
-    assert (effect["kind"], effect["at"]) == ("actuator_gain", ["arm.j3"])
+    assert (effect["kind"], effect["at"]) == ("actuator_gain", "arm.j3")
     gain = effect["parameters"]["gain"]
     assert abs(gain["value"] - 1.0 / 1.1) < 2.0 * gain["std"] < 0.08
