@@ -339,5 +339,5 @@ def parameter_learner_config(
     pairs = [replace(pairs[0], anisotropy=LEANING), *pairs[1:]]
     Q_d = np.zeros(N_X)
     Q_d[V_TIP] = Q_d[V_BALL] = own.weight  # It stays on the table, too.
-    Q_d[W_BALL] = own.weight * own.turn_radius**2
+    Q_d[W_BALL.start + 2] = own.weight * own.turn_radius**2
     return ParameterLearnerConfig(pairs, items, Q_d.tolist(), own.contact_std)

@@ -10,7 +10,11 @@ from pydrake.systems.primitives import ConstantVectorSource
 
 from makebreak.benchmarks import parameter_learner as bench
 from makebreak.benchmarks.plants import diagram_of
-from makebreak.diagrams.push_object_config import contact_pairs
+from makebreak.diagrams.push_object_config import (
+    PushParametersConfig,
+    contact_pairs,
+    parameter_learner_config,
+)
 from makebreak.models.pushed_object import PushedObject, make_tip_and_object
 from makebreak.models.tip_and_ball import TipAndBall, make_tip_and_ball
 from makebreak.systems.contact_mpc.careful_goal import CarefulGoal, CarefulGoalConfig
@@ -487,6 +491,70 @@ def test_the_interval_of_what_slides_holds_as_often_as_it_says():
         off = (belief.mean - np.log(mu / BOX_MU) / 0.5) / belief.std
         inside.append(abs(off[0]) < 1.645)
     assert 0.85 <= np.mean(inside) <= 0.95
+
+
+def pushed_box(speed, acceleration, excess=0.0, **settings):
+    """A learner of the box's mass and its friction on the table, and a step in which
+    push_object's finger pushes it by the force of Newton's law, plus `excess` [N]."""
+    spec, tip = PushedObject("box"), TipAndBall(tip_mass=1.0, tip_radius=0.02)
+    pairs = contact_pairs(spec, BOX_MU)
+    items = [
+        Parameter("mass", 0.5, "object"),
+        Parameter("friction", 0.5, pairs=list(range(1, len(pairs)))),
+    ]
+    smooth = [replace(pairs[0], friction=0.0), *pairs[1:]]
+    config = parameter_learner_config(PushParametersConfig(), smooth, items)
+    learner = ParameterLearner(
+        make_tip_and_object(spec, tip)[0], replace(config, **settings), 0.05
+    )
+    ends = np.tile(learner.model.x_default, (2, 1))
+    ends[:, P_BALL], ends[:, P_TIP] = [0.0, 0.0, 0.02], [-0.07, 0.0, 0.02]
+    ends[:, V_BALL.start] = ends[:, V_TIP.start] = speed, speed + 0.05 * acceleration
+    for at, way in ((P_BALL, V_BALL), (P_TIP, V_TIP)):
+        ends[1, at] += 0.05 * ends[:, way].mean(axis=0)
+    force = spec.mass * (BOX_MU * 9.81 + acceleration) + excess
+    u = np.array([tip.tip_mass * acceleration + force, 0.0, 0.0])
+    return learner, Sample(ends[0], u, ends[1], *learner.model.between(*ends))
+
+
+@pytest.mark.parametrize("acceleration", [-1.0, 0.0, 1.0])
+def test_a_push_tells_of_mass_and_friction_what_a_closed_form_says(acceleration):
+    """tip dv_tip + m dv + mu m g dt = u dt, each dv with noise of its own, and the
+    normal force with that of the vertical: at a steady speed the product alone."""
+    learner, sample = pushed_box(
+        0.2,
+        acceleration,
+        error_share=0.0,
+        trust=1.0,
+        slip_noise=1e-3,
+        contact_std=0.5,
+    )
+    belief, _ = learner._learned(prior(2), sample)
+    m, friction = 0.4, 0.4 * BOX_MU * 9.81 * 0.05
+    told = 0.5 * np.array([m * acceleration * 0.05 + friction, friction])
+    variance = (1.0 + m**2 * (1.0 + BOX_MU**2)) / PushParametersConfig().weight
+    # The contacts' softness takes a little.
+    np.testing.assert_allclose(
+        belief.information - np.eye(2), np.outer(told, told) / variance, rtol=0.05
+    )
+
+
+@pytest.mark.parametrize("excess", [0.1, 0.3, 0.5])
+def test_what_may_stick_tells_of_no_mass_instead_of_a_friction(excess):
+    """A finger that presses a little more than the model's friction holds, on a box
+    that rests. The mass alone was taken for larger, as surely as by a whole push."""
+    learner, sample = pushed_box(0.0, 0.0, excess)
+    belief, found = learner._learned(prior(2), sample)
+    assert found is not None and found.lam.any()
+    assert belief.std[0] > 0.99 and abs(belief.mean[0]) < 0.02
+
+
+def test_a_box_that_is_pressed_at_its_edge_is_not_taken_for_a_heavier_one():
+    """The model's three supports stand inside the object's edges, and would tilt."""
+    Q_d = parameter_learner_config(
+        PushParametersConfig(), contact_pairs(PushedObject("box"), 1.0), []
+    ).Q_d
+    assert not np.any(Q_d[W_BALL][:2]) and Q_d[W_BALL][2] > 0.0
 
 
 @pytest.mark.parametrize(("after", "counts"), [(0.35, True), (0.8, False)])
