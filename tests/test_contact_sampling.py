@@ -624,6 +624,21 @@ def test_the_target_is_the_goal_or_a_part_of_the_way():
     assert (far[:, 2] == HEIGHT).all() and not far[:, 10:].any()
 
 
+def test_noise_changes_the_way_of_half_a_turn_at_most_once():
+    """A T whose goal was half a turn away was never pushed in 60 s: with each tick the
+    shorter way was the other one, and the tip went to another place."""
+    rng, goal, before, ways = np.random.default_rng(0), [0.5, 0.0, np.pi], None, []
+    for _ in range(50):
+        x = state([0.4, 0.0, 0.1], (0.5, 0.0, 0.01 * rng.normal()))
+        before = look_ahead(PushConfig(), x, np.array(goal), HEIGHT, 1, before)[0]
+        ways.append(angle_between(heading(x[Q_BALL]), heading(before[Q_BALL])))
+    assert abs(np.sum(np.sign(ways))) == 50 and min(np.abs(ways)) == pytest.approx(0.5)
+    x = state([0.4, 0.0, 0.1], (0.5, 0.0, -0.3 * np.sign(ways[0])))
+    other = look_ahead(PushConfig(), x, np.array(goal), HEIGHT, 1, before)[0]
+    turn = angle_between(heading(x[Q_BALL]), heading(other[Q_BALL]))
+    assert turn == pytest.approx(-ways[0])  # The shorter one by far.
+
+
 def test_what_the_arm_hides_on_its_way_is_gone_to_and_pushed_a_little(planner):
     """Waited for at once, it would be seen, gone to and hidden again without end."""
     shape, config = planner[2], PushConfig()

@@ -109,7 +109,8 @@ class PushTask(LeafSystem):
         discrete = state.get_mutable_discrete_state()
         seen = valid[0] > 0.5 and is_finite(goal)
         if is_finite(goal):
-            target = look_ahead(c.push, x, goal, c.height, self._n_knots)
+            before = context.get_discrete_state(self._x_desired).value()[:N_X]
+            target = look_ahead(c.push, x, goal, c.height, self._n_knots, before)
             discrete.set_value(int(self._x_desired), target.ravel())
         place = command[1:] if command[0] > 0.0 else None
         try:

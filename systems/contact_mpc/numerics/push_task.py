@@ -33,6 +33,10 @@ from makebreak.systems.contact_mpc.numerics.tip_travel import travel_step
 
 # CONTACT is what ArmReference follows C3 in (numerics/rolling_task.py: ROLL).
 CONTACT, TRAVEL, WAIT = 0, 1, 2
+# So near to half a turn the object goes on turning the way it did: either is as short,
+# and the noise of its pose would change the way, and with it the place, again and again
+# [rad].
+HALF_TURN = 0.2
 # A tip that is so far above where it should be on its way down has come down on the
 # object, which is larger than believed, or elsewhere: it goes up, and after that comes
 # down so much farther out; not farther than EXTRA_MAX, where it no longer matters [m].
@@ -136,15 +140,19 @@ def errors(x, goal) -> tuple[float, float]:
     return float(np.hypot(*off)), float(abs(angle_between(heading(x[Q_BALL]), goal[2])))
 
 
-def look_ahead(config: PushConfig, x, goal, height: float, n_knots: int):
+def look_ahead(config: PushConfig, x, goal, height: float, n_knots: int, before=None):
     """C3's target (n_knots, 19): the goal, or the part of the way to it that a plan is
     good for; the tip at the height of pushing, everything at rest.
 
-    Args: x (19,); goal (3,) = x, y [m], yaw [rad]; height of the tip's centre [m].
+    Args: x (19,); goal (3,) = x, y [m], yaw [rad]; height of the tip's centre [m];
+        before (19,): the last target, or None.
     """
     off = goal[:2] - x[P_BALL][:2]
     off = off * min(1.0, config.look_ahead / max(np.hypot(*off), 1e-12))
     turn = angle_between(heading(x[Q_BALL]), goal[2])
+    if before is not None and abs(turn) > np.pi - HALF_TURN:
+        on = angle_between(heading(x[Q_BALL]), heading(before[Q_BALL]))
+        turn -= np.copysign(2.0 * np.pi, turn) if on * turn < 0.0 else 0.0
     turn = np.clip(turn, -config.look_ahead_angle, config.look_ahead_angle)
     w, z = np.cos(turn / 2.0), np.sin(turn / 2.0)
     a, b, c, d = x[Q_BALL]
