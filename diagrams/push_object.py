@@ -46,6 +46,7 @@ from makebreak.diagrams.push_object_config import (
     PLAN_DT,
     PUSH_OBJECT,
     SET_BY_DIAGRAM,
+    STEADY,
     TIP_MASS,
     PushModelConfig,
     PushObjectConfig,
@@ -181,8 +182,9 @@ def make_push_object(
         if items:
             users = [lcs["plan"], lcs["command"], planning.sampler]
             pairs = contact_pairs(model.spec, model.friction)
+            steady = 0.0 if model.rolls else STEADY
             parameter_learner = ParameterLearner(
-                make_tip_and_object(model.spec, model.tip)[0],
+                make_tip_and_object(model.spec, model.tip, steady)[0],
                 parameter_learner_config(config.parameters, pairs, items),
                 LEARN,
                 OFFSET["learner"],

@@ -27,7 +27,7 @@ import numpy as np
 from pydrake.geometry import Box, Convex, Cylinder, Shape, Sphere
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
-from pydrake.multibody.tree import CalcSpatialInertia, SpatialInertia
+from pydrake.multibody.tree import CalcSpatialInertia, SpatialInertia, UnitInertia
 from pydrake.systems.framework import DiagramBuilder
 from scipy.spatial import ConvexHull, QhullError
 
@@ -417,11 +417,14 @@ def object_file(spec: PushedObject) -> str:
     return str(path)
 
 
-def make_tip_and_object(spec: PushedObject, tip: TipAndBall | None = None):
+def make_tip_and_object(
+    spec: PushedObject, tip: TipAndBall | None = None, steady: float = 0.0
+):
     """The planner's model of an arm that pushes an object: a point mass and a free body
     on a table, as make_tip_and_ball for a ball.
 
-    Args: tip: only its tip_mass [kg] and tip_radius [m] are used.
+    Args: tip: only its tip_mass [kg] and tip_radius [m] are used; steady: radius of
+        gyration that is added about the horizontal axes, against tilting [m].
     Returns: (diagram, plant, scene_graph) with the bodies `tip`, a sphere; `object`,
         with collision geometries object::part_i, its convex parts, and
         object::support_i, the spheres that it stands on; and `table`, a wide box with
@@ -433,6 +436,11 @@ def make_tip_and_object(spec: PushedObject, tip: TipAndBall | None = None):
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=1e-3)
     add_tip(plant, TipAndBall() if tip is None else tip)
     inertia = object_inertia(spec)
+    unit = inertia.get_unit_inertia()
+    moments = unit.get_moments() + steady**2 * np.array([1.0, 1.0, 0.0])
+    inertia = SpatialInertia(
+        spec.mass, inertia.get_com(), UnitInertia(*moments, *unit.get_products())
+    )
     body = plant.AddRigidBody("object", plant.AddModelInstance("object"), inertia)
     shapes = {f"part_{i}": _above_table(p, spec) for i, p in enumerate(parts(spec))}
     centers, radius = support_spheres(spec)
