@@ -71,10 +71,10 @@ TIP_MASS = 1.0  # Mass of the point that stands for the arm in the planner's mod
 # tilted by up to half a right angle, and presses or lifts more than the tip's sphere,
 # which alone is modelled, could by friction.
 LEANING = 4.0
-# Radius of gyration that is added against tilting in the learner's model [m]. The height
-# at which the tip touches is not known (LEANING), so neither is the moment of its force
-# about a horizontal axis: 2 N that are 16 mm higher turn this by a third of what counts as
-# noise. A press on the object's edge was taken for a mass that keeps it down.
+# Radius of gyration added against tilting in the model of the learner [m]. The height
+# at which the tip touches is not known (LEANING), and so is not the moment of its force
+# about a horizontal axis: 2 N that are 16 mm higher turn this by a third of what counts
+# as noise. A press on the object's edge was taken for a mass that keeps it down.
 STEADY = 0.2
 N_TIP = 4  # The first entries of lam: the contact of tip and object.
 # Settings of the systems that make_push_object computes, so that users cannot.
