@@ -306,7 +306,7 @@ def felt(found: Explained, root) -> np.ndarray:
     return ((size > BEYOND_NOISE) @ each @ (found.acting.ways != 0.0)).astype(bool)
 
 
-def _beyond(columns, free):
+def _unexplained(columns, free):
     """What of the columns (n, k) no combination of those of free (n, m) is."""
     return columns - free @ np.linalg.lstsq(free, columns, rcond=1e-9)[0]
 
@@ -329,14 +329,14 @@ def gradient_and_information(
     closed, free = (found.eta == 0.0) & felt(found, root), found.f > 0.0
     of_z = np.vstack([root @ dx, stiff * dw[closed]])
     of_lam = np.vstack([root @ found.D[:, free], stiff * found.F[np.ix_(closed, free)]])
-    of_z = _beyond(of_z, of_lam)
+    of_z = _unexplained(of_z, of_lam)
     missed = np.append(root @ error, stiff * loss.gamma * found.force[closed])
     noise = one_sided & (
         (of_z.T @ missed) ** 2 <= BEYOND_NOISE**2 * (of_z**2).sum(axis=0)
     )
     # Then its friction may be any, and what another parameter changes as a friction
     # does tells as little: a mass would get what the friction is not allowed to.
-    told = _beyond(of_z, of_z[:, noise])
+    told = _unexplained(of_z, of_z[:, noise])
     gradient, of_z = gradient + (told - of_z).T @ missed, told
     # A force at a distance stands for what the model lacks, and tells of gaps alone.
     far = BEYOND_NOISE * np.sqrt(loss.eps * loss.gamma) * found.acting.rows.sum(axis=0)
