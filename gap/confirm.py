@@ -310,10 +310,13 @@ def _moves(problem: GapProblem, joint: str, body: str) -> bool:
 def is_confirmed(gap: GapMeasure, acts_at: Callable[[str], bool]) -> bool:
     """Whether simulated windows do better with what is named, all together or the
     channels at which an effect acts; where they show no gap without it, whether they
-    show none with it, and the equations of motion say the same of what shows in
-    them."""
+    show none with it, and are no worse unless the equations of motion are better, and
+    these say the same of what shows in them."""
     if gap.before > AGREEMENT_RMS_MAX:
         return closed_at(gap, acts_at) >= CLOSED_SHARE_MIN
+    worse = gap.after > gap.before
+    if worse and (gap.in_equations is None or gap.reduction_in_equations <= 0.0):
+        return False
     return gap.after <= AGREEMENT_RMS_MAX and _equations_confirm(gap)
 
 

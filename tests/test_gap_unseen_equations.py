@@ -113,6 +113,10 @@ def test_recordings_that_are_too_short_tell_nothing(pushes):
     ("windows", "equations", "good"),
     [
         ((0.9, 0.8), None, True),
+        ((0.8, 0.8), None, True),  # A sensor's bias.
+        ((0.8, 0.81), None, False),
+        ((0.8, 0.81), (1.2, 1.2), False),
+        ((0.8, 0.81), (9.0, 1.1), True),
         ((0.9, 0.8), (9.0, 1.1), True),
         ((0.9, 0.8), (9.0, 6.0), False),
         ((0.9, 0.8), (1.2, 1.3), True),  # They show nothing there.
