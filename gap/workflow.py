@@ -233,6 +233,9 @@ def _run(
         say("asking when measured efforts act")
         parts, found = _with_efforts_of_loops(scene, parts, limbs, jobs)
         checks += found
+    if len(limbs) > 1:
+        scene, parts, found = _with_commands_of_most(scene, parts, limbs, jobs)
+        checks += found
     if len(limbs) < 2:
         result = _compared(scene, dynamics, parts, meets, checks, jobs, say, clock)
         return replace(result, seconds={**seconds, **result.seconds})
@@ -291,14 +294,9 @@ def _compared(
     if is_mechanism and not meets:
         scene = without_shapes(scene)
     problem, found = problem_for(scene, decided, dynamics, jobs, meets)
-    as_they_act, told, late = _commands_of(problem)
-    if as_they_act is not None:
-        loops = {LOOPS: max(scene.tolerance.get(LOOPS, 0.0), late)} if late else {}
-        scene = replace(scene, tolerance={**scene.tolerance, **loops})
-        parts = replace(
-            parts, decided=as_they_act(parts.decided),
-            reported=as_they_act(parts.reported),
-        )  # fmt: skip
+    acting = _with_commands_of(problem, scene, parts)
+    if acting is not None:
+        scene, parts, told = acting
         decided, reported, done = _conditioned(parts, dynamics, not meets)
         problem, found = problem_for(scene, decided, dynamics, jobs, meets)
         found += told
@@ -436,12 +434,7 @@ def _with_efforts_of_loops(
 
     def gained(limb: Sequence[str]) -> np.ndarray:
         mine = only(limb, scene, parts) if len(limbs) > 1 else (scene, parts)
-        own, its = without_shapes(mine[0]), mine[1]
-        dynamics = SceneDynamics(own)
-        decided, *others = (
-            _conditioned(replace(its, decided=some), dynamics, True)[0]
-            for some in (its.decided, *(way(its.decided) for way in ways))
-        )
+        own, dynamics, decided, *others = _as_compared(*mine, *ways)
         try:
             return MechanismProblem(own, decided).gained_by_efforts(others)
         except DoesNotFit:  # It is too short.
@@ -457,20 +450,74 @@ def _with_efforts_of_loops(
     return replace(parts, decided=decided, reported=reported), [said]
 
 
-def _commands_of(problem: GapProblem):
-    """What makes commands (of recordings) what the motion says that they are, None
-    where they are as their rows have them; what is said of it; and to what what drives
-    feed back is known then [s], 0 where that is no other."""
-    if isinstance(problem, MechanismProblem):
-        if problem.commands_are_samples():
-            said = sampled_commands.finding(problem.recordings)
-            return sampled_commands.as_samples, [said], 0.0
-        if early := problem.commands_early():
-            first, row = problem.recordings[0], problem.row_sec()
-            said = sampled_commands.finding_of_moved(first.name, -early, row)
-            # Of a simulator's steps all that goes with velocities is half a step off.
-            return partial(moved_sooner, early=early), [said], early
-    return None, [], 0.0
+def _as_compared(scene: Scene, parts: Split, *ways: Callable):
+    """The scene of a mechanism that nothing touches, its dynamics, and what is decided
+    on as it is compared: as it is, and in other ways."""
+    scene = without_shapes(scene)
+    dynamics = SceneDynamics(scene)
+    every = (parts.decided, *(way(parts.decided) for way in ways))
+    return (
+        scene,
+        dynamics,
+        *(
+            _conditioned(replace(parts, decided=some), dynamics, True)[0]
+            for some in every
+        ),
+    )
+
+
+def _with_commands_of_most(
+    scene: Scene, parts: Split, limbs: Sequence[Sequence[str]], jobs: int
+) -> tuple[Scene, Split, list[Finding]]:
+    """Scene and recordings with commands that act when the motion of most limbs says:
+    one loop drives all, and in a single limb it may look like what its joints lack."""
+
+    def early(limb: Sequence[str]) -> float:
+        own, _, decided = _as_compared(*only(limb, scene, parts))
+        try:
+            return MechanismProblem(own, decided).commands_early()
+        except DoesNotFit:  # It is too short.
+            return 0.0
+
+    each = list(side_by_side([partial(early, limb) for limb in limbs], jobs))
+    found = [by for by in each if by > 0.0]
+    if len(found) < max(2, len(each) / 2):
+        return scene, parts, []
+    return _with_sooner(scene, parts, float(np.median(found)))
+
+
+def _with_commands_of(
+    problem: GapProblem, scene: Scene, parts: Split
+) -> tuple[Scene, Split, list[Finding]] | None:
+    """Scene and recordings with commands that act as the motion says, and what is said
+    of it; None where they act as their rows have them."""
+    if not isinstance(problem, MechanismProblem):
+        return None
+    if problem.commands_are_samples():
+        said = sampled_commands.finding(problem.recordings)
+        decided, reported = map(
+            sampled_commands.as_samples, (parts.decided, parts.reported)
+        )
+        return scene, replace(parts, decided=decided, reported=reported), [said]
+    early = problem.commands_early()
+    return _with_sooner(scene, parts, early) if early else None
+
+
+def _with_sooner(
+    scene: Scene, parts: Split, early: float
+) -> tuple[Scene, Split, list[Finding]]:
+    """With commands that act so much sooner [s]. Of a simulator's steps all that goes
+    with velocities is half a step off, too."""
+    first, row = parts.decided[0], min(r.period_sec() for r in parts.decided)
+    loops = {LOOPS: max(scene.tolerance.get(LOOPS, 0.0), early)}
+    decided, reported = (
+        moved_sooner(x, early) for x in (parts.decided, parts.reported)
+    )
+    return (
+        replace(scene, tolerance={**scene.tolerance, **loops}),
+        replace(parts, decided=decided, reported=reported),
+        [sampled_commands.finding_of_moved(first.name, -early, row)],
+    )
 
 
 def problem_for(

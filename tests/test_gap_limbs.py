@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 from effect_scenes import with_effects
 
+from makebreak.gap import workflow
 from makebreak.gap.by_part import joined, limbs_of, only, pooled
 from makebreak.gap.data.findings import Finding
 from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.data.split import split
 from makebreak.gap.report.comparison import shown_motion
+from makebreak.gap.residuals.inverse import LOOPS
+from makebreak.gap.residuals.mechanism import MechanismProblem
 from makebreak.gap.result import (
     Estimate,
     Evidence,
@@ -19,7 +22,7 @@ from makebreak.gap.result import (
     NamedEffect,
     Series,
 )
-from makebreak.gap.workflow import run_gap
+from makebreak.gap.workflow import _with_commands_of_most, run_gap
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects.kind import Effect
 from makebreak.models.scene import read_scene
@@ -143,6 +146,29 @@ def test_one_limb_is_named_and_the_other_agrees(tmp_path):
 
 
 # ----- One result of several
+
+
+@pytest.mark.parametrize(
+    ("early", "by"),
+    [((4e-4, 6e-4), 5e-4), ((0.0, 6e-4), 0.0), ((4e-4, 6e-4, 0.0, 0.0), 5e-4)],
+)
+def test_commands_of_one_loop_act_when_half_of_the_limbs_say(
+    tmp_path, monkeypatch, early, by
+):
+    """In a single limb half a step may look like what its joints lack."""
+    scene, file = recorded(tmp_path, [], 4.0)
+    parts = split(read_recordings([file]))
+    left = iter(early)
+    monkeypatch.setattr(MechanismProblem, "commands_early", lambda self: next(left))
+    moved = []
+    monkeypatch.setattr(
+        workflow, "moved_sooner", lambda some, by: (moved.append(by), [*some])[1]
+    )
+    limbs = (LIMBS * 2)[: len(early)]
+    then, sooner, found = _with_commands_of_most(scene, parts, limbs, 1)
+    assert then.tolerance.get(LOOPS, 0.0) == pytest.approx(by)
+    assert len(found) == (by > 0.0) and (sooner is parts) == (by == 0.0)
+    assert moved == pytest.approx([by] * 2 if by else [])
 
 
 def result_of(verdict, effects=(), before=4.0, after=1.0, channel="r.a0.position", n=4):
