@@ -1169,6 +1169,24 @@ def test_a_friction_that_may_be_what_the_scene_has_is_not_named(
     assert _is_certain(search, [choice], None, 0) == named
 
 
+def test_evidence_of_what_a_simulation_leaves_counts_what_its_nuisances_cost():
+    """As that of a fit: of two that leave the same the one with less of it."""
+    rng = np.random.default_rng(4)
+    search = object.__new__(Comparison)
+    search.train = np.arange(200) % 30 < 20
+    search.nuisances = SimpleNamespace(prior=np.array([0.1, 2.0]))  # type: ignore[assignment]
+    search.problem = SimpleNamespace(correlation=1.0)  # type: ignore[assignment]
+    search.start = SimpleNamespace(score=1.0)  # type: ignore[assignment]
+    left, fit = rng.normal(size=200), SimpleNamespace(held_out=1.0)
+    # The last is a column beside the nuisances, which costs nothing.
+    one = SimpleNamespace(b=np.array([0.0, 2.0, 9.0]), left=left, fit=fit)
+    other = SimpleNamespace(b=np.array([0.3, -4.0]), left=left, fit=fit)
+    evidence = search.evidence_against(one.b, left, fit, other, 0)  # type: ignore[arg-type]
+    assert evidence == pytest.approx((9.0 + 4.0) - 1.0)
+    one.b = one.b[:2]
+    assert search.evidence(one, other, 0) == pytest.approx(evidence)  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize(
     ("score", "jumps", "named"),
     [(0.96, True, False), (0.94, True, True), (0.96, False, True)],
