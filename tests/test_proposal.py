@@ -802,6 +802,8 @@ def test_efforts_of_a_stiff_loop_tell_gains_where_each_row_has_a_new_command(row
     # Means over rows fit as well, with gains that are a tenth off or more.
     (by_means,) = gains_of_efforts([replace(log, velocity=None)], [None])
     assert by_means.kp != pytest.approx(kp, rel=0.05)
+    # No delay is read from what means leave by themselves.
+    assert (by_means.kp < 0.5 * kp) == (rows_late > 0)
 
 
 def test_without_efforts_no_joint_has_gains_by_them():

@@ -559,7 +559,7 @@ def test_a_narrow_terminal_breaks_no_name():
     name, channel = "arm.joint-1.effort_measured", "arm.joint1.effort_measured"
     heads = ("column", "samples", "empty", "proposed channel", "reason")
     why = "has a channel's name already"
-    table = Table(f"/tmp/a-b/{name}", heads, [(name, 12, "", channel, why)] * 2)
+    table = Table(f"runs/a-b/{name}", heads, [(name, 12, "", channel, why)] * 2)
     for width in (20, 40, 60, 80, 100):
         lines = table.to_text(width).splitlines()
         assert sum(name in line.split() for line in lines) == 2

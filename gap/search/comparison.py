@@ -37,6 +37,11 @@ from makebreak.gap.thresholds import (
 from makebreak.models.effects.kind import Effect
 
 
+def _cost(b: np.ndarray, prior: np.ndarray) -> float:
+    """What nuisances cost; columns beside them (the last of b) cost nothing."""
+    return float(np.sum((b[: len(prior)] / prior) ** 2))
+
+
 class Comparison:
     """A problem with the fit of the scene as it came, against which all is measured.
 
@@ -251,9 +256,9 @@ class Comparison:
         ratio of likelihoods, with the nuisances' prior.
         """
         least = min(one.fit.held_out, other.fit.held_out)
-        n = self.nuisances.prior
-        cost = [float(np.sum((f.b / n) ** 2)) for f in (one, other)]
-        return self._evidence(one.left, other.left, least, more) + cost[1] - cost[0]
+        prior = self.nuisances.prior
+        cost = _cost(other.b, prior) - _cost(one.b, prior)
+        return self._evidence(one.left, other.left, least, more) + cost
 
     def evidence_of(self, screen: Screen, X: np.ndarray) -> float:
         """The same of columns (m, k) against none."""
@@ -265,9 +270,9 @@ class Comparison:
         """The same of a model's nuisances b (n_b,), what it leaves of rows (m,), and
         its fit, over another."""
         least = min(fit.held_out, other.fit.held_out)
-        n = self.nuisances.prior
-        cost = [float(np.sum((x[: len(n)] / n) ** 2)) for x in (b, other.b)]
-        return self._evidence(left, other.left, least, more) + cost[1] - cost[0]
+        prior = self.nuisances.prior
+        cost = _cost(other.b, prior) - _cost(b, prior)
+        return self._evidence(left, other.left, least, more) + cost
 
     def evidence_by_columns(self, screen: Screen, one, other) -> float:
         """The same of columns (m, k), beside others that a screen may have as further
@@ -278,10 +283,10 @@ class Comparison:
               for X, fit in zip((one, other), fits, strict=True)),
             strict=True,
         )  # fmt: skip
-        prior, more = self.nuisances.prior, one.shape[1] - other.shape[1]
-        cost = [float(np.sum((x[: len(prior)] / prior) ** 2)) for x in b]
-        least = min(fit.held_out for fit in fits)
-        return self._evidence(left[0], left[1], least, more) + cost[1] - cost[0]
+        least, more = min(fit.held_out for fit in fits), one.shape[1] - other.shape[1]
+        prior = self.nuisances.prior
+        cost = _cost(b[1], prior) - _cost(b[0], prior)
+        return self._evidence(left[0], left[1], least, more) + cost
 
     def _evidence(self, one, other, least: float, more: int) -> float:
         """Of what two models leave of rows (m,), the better of them `least` of those
