@@ -233,7 +233,7 @@ def _run(
         say("asking when measured efforts act")
         parts, found = _with_efforts_of_loops(scene, parts, limbs, jobs)
         checks += found
-    if len(limbs) > 1:
+    if len(limbs) > 1 and any(r.commands() for r in parts.decided):
         scene, parts, found = _with_commands_of_most(scene, parts, limbs, jobs)
         checks += found
     if len(limbs) < 2:
