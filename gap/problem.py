@@ -41,6 +41,8 @@ class SearchPlan:
     counts_evidence: whether evidence counts below the noise, too: rows are over the
         covariance that they have, and the law of contact is that of the data; or
         simulations show a gap where rows agree.
+    evidence_alone: whether evidence is then enough for an effect, as it is of rows
+        that do not jump.
     """
 
     evaluations: int = 8
@@ -55,6 +57,7 @@ class SearchPlan:
     simulation_agrees: bool = False
     loud: float = 3.0
     counts_evidence: bool = False
+    evidence_alone: bool = False
 
 
 @dataclass(frozen=True, eq=False)

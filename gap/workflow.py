@@ -340,7 +340,7 @@ def _compared(
         noise of light joints is large, and simulated windows do not: what there is
         evidence for is taken."""
         first = problem, selection, result
-        problem.plan = replace(problem.plan, counts_evidence=True)
+        problem.plan = replace(problem.plan, counts_evidence=True, evidence_alone=True)
         say("searching the catalogue by evidence")
         then = select(problem, say)
         if not then.choices:

@@ -121,13 +121,13 @@ class Comparison:
     def may_need_more(self, fitted: Fitted) -> bool:
         """The same, or one channel is above what an effect of it alone must be beyond,
         where models can be compared by evidence. Where nothing but evidence says it,
-        candidates are asked; where errors jump unless the scene as it came was above
-        the noise."""
+        candidates are asked; where evidence alone is not enough, unless effects have
+        brought the scene down to the noise."""
         if self.needs_more(fitted):
             return True
         if self.plan.counts_evidence:
-            above = fitted.effects and self.plan.jumps and self.needs_more(self.start)
-            return not above
+            alone = self.plan.evidence_alone or not fitted.effects
+            return alone or not self.needs_more(self.start)
         if not self.tells_by_evidence or not self.plan.by_channel:
             return False
         noisy = self.problem.in_noise(fitted.left)
@@ -137,8 +137,7 @@ class Comparison:
     def is_needed(self, more: Fitted, fitted: Fitted, parameters: int) -> bool:
         """Whether what a fit has more than another is missing there: an effect is, or
         all rows together are near the noise and it is there beyond doubt."""
-        asked = self.plan.counts_evidence and not self.plan.jumps
-        least = EVIDENCE_MIN if asked else BESIDE_NOISE_EVIDENCE
+        least = EVIDENCE_MIN if self.plan.evidence_alone else BESIDE_NOISE_EVIDENCE
         return (
             self.needs_more(fitted) or self.evidence(more, fitted, parameters) > least
         )

@@ -314,9 +314,10 @@ def _is_certain(
     least = search.problem.least(kind, at)
     if not is_significant(choice, alone) or not is_sane(choice.effect, least):
         return False
-    # What was taken by evidence alone has to show by the weights of now, where errors
-    # jump.
-    if alone and search.plan.counts_evidence and search.plan.jumps:
+    # What was taken by evidence alone has to show by the weights of now, where that is
+    # not enough.
+    plan = search.plan
+    if alone and plan.counts_evidence and not plan.evidence_alone:
         if search.error(current.score) > search.enough(search.start.score):
             return False
     endless = any(each.endless for each in KINDS[kind].parameters)
