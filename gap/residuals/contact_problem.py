@@ -30,11 +30,10 @@ from makebreak.gap.residuals.contact_means import SLIDES
 from makebreak.gap.residuals.lying_on_faces import lying_on_faces
 from makebreak.gap.residuals.mechanism import link_changes
 from makebreak.gap.residuals.mechanism_candidates import tolerances
-from makebreak.gap.residuals.objects import unexplained_in_windows
 from makebreak.gap.residuals.permitted_contacts import Shift
 from makebreak.gap.residuals.pose_times import earlier
 from makebreak.gap.residuals.touching import ROBUST
-from makebreak.gap.residuals.where import where_in_windows
+from makebreak.gap.residuals.where import unexplained_in_windows, where_in_windows
 from makebreak.gap.residuals.widened_contacts import (
     distances_off,
     sentence,

@@ -46,8 +46,7 @@ from makebreak.gap.residuals.mechanism_candidates import (
     values_tried,
 )
 from makebreak.gap.residuals.mechanism_motion import bearings_of
-from makebreak.gap.residuals.objects import unexplained_in_windows
-from makebreak.gap.residuals.where import where_in_windows
+from makebreak.gap.residuals.where import unexplained_in_windows, where_in_windows
 from makebreak.gap.result import Where
 from makebreak.gap.simulation.driven_arm import DrivenArmSimulation, can_have
 from makebreak.gap.simulation.measure import gap_measure, series_of, why_stopped

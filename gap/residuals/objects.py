@@ -19,8 +19,8 @@ from makebreak.gap.problem import (
 from makebreak.gap.residuals.contact import contact_candidates, contact_nuisances
 from makebreak.gap.residuals.lying_on_faces import one_point
 from makebreak.gap.residuals.touch import TouchModel, touch_candidates
-from makebreak.gap.residuals.where import where_in_windows
-from makebreak.gap.result import Unexplained, Where
+from makebreak.gap.residuals.where import unexplained_in_windows, where_in_windows
+from makebreak.gap.result import Where
 from makebreak.gap.simulation.free_windows import FreeBodyModel, touched
 from makebreak.gap.simulation.measure import (
     gap_measure,
@@ -209,64 +209,3 @@ def point_on_face_of(model: FreeBodyModel) -> list[Finding]:
             )
         )  # fmt: skip
     return found
-
-
-def unexplained_in_windows(
-    model: FreeBodyModel | WindowModel, simulated: Sequence[np.ndarray]
-) -> list[Unexplained]:
-    """Of each channel what is left, while what, and what its size goes with."""
-    errors = model.errors(simulated)
-    used = [
-        k for k, e in enumerate(errors) if len(e) and not np.isinf(simulated[k]).any()
-    ]
-    if not used:
-        return []
-    names = model.channels
-    features: dict[str, list[np.ndarray]] = {}
-    for k in used:
-        w = model.windows[k]
-        recording = model.recordings[w.recording]
-        time = recording.time[w.rows]
-        features.setdefault("time since the window's start", []).append(time - w.start)
-        for c in names:
-            if c.rsplit(".", 1)[-1] in ("x", "y", "z", "position"):
-                y = recording[c][w.rows]
-                good = np.isfinite(y)
-                if good.sum() < 2:
-                    y, good = np.zeros(len(time)), np.ones(len(time), bool)
-                y = np.interp(time, time[good], y[good])
-                features.setdefault(f"the value of {c}", []).append(y)
-                rate = np.gradient(y, time)
-                features.setdefault(f"the rate of {c}", []).append(rate)
-    E = np.concatenate([errors[k] for k in used])
-    out = []
-    for i, name in enumerate(names):
-        size = float(np.sqrt(np.mean(E[:, i] ** 2)))
-        if size < 2.0:
-            continue
-        shares = {
-            what: share_explained(np.concatenate(x), E[:, i])
-            for what, x in features.items()
-        }
-        best = max(shares, key=lambda what: shares[what])
-        goes = "nothing that is measured"
-        if shares[best] > 0.2:
-            goes = f"{best} (it tells {shares[best]:.0%} of its variance)"
-        worst = max(used, key=lambda k: float(np.mean(errors[k][:, i] ** 2)))
-        w = model.windows[worst]
-        region = f"most in episode {w.episode}, from {w.start:.3g} s"
-        out.append(Unexplained(name, region, size, goes))
-    return sorted(out, key=lambda each: -each.size)
-
-
-def share_explained(x: np.ndarray, y: np.ndarray, bins: int = 12) -> float:
-    """Share of the variance of y (n,) that its mean in bins of x (n,) tells, less what
-    chance gives."""
-    if np.std(x) == 0.0 or np.std(y) == 0.0 or len(y) <= bins:
-        return 0.0
-    edges = np.quantile(x, np.linspace(0, 1, bins + 1)[1:-1])
-    group = np.searchsorted(edges, x)
-    count = np.bincount(group, minlength=bins)
-    mean = np.bincount(group, y, minlength=bins) / np.maximum(count, 1)
-    within = float(np.sum((y - mean[group]) ** 2))
-    return 1.0 - within / (len(y) - bins) / float(np.var(y, ddof=1))

@@ -16,6 +16,8 @@ from makebreak.models.effects.kind import full_name, one_dof_joints
 FALSE_RATE = 0.01  # Share of the windows told that may stand out by chance.
 ALLOWED = 1.3  # What estimates of noise may be off by.
 MOST = 300
+LOUD = 2.0  # Rms over noise of what is said to be left.
+BINS, EXPLAINED = 12, 0.2  # Of a feature; share of the variance that it explains.
 ALIKE = 2.0  # Neighbours are told as one if what happened, and how much, is alike.
 
 
@@ -84,45 +86,87 @@ def where_in_windows(model: Any, errors: Sequence[np.ndarray]) -> list[Where]:
     return _merged(found, benjamini_hochberg(p, FALSE_RATE))
 
 
-def unexplained(model: InverseModel, left: np.ndarray, least: float = 2.0):
+def unexplained(model: InverseModel, left: np.ndarray) -> list[Unexplained]:
     """What is left of each joint's equation, and what it goes with."""
     names = model.names()
-    R = left.reshape(-1, len(names))
-    features: dict[str, np.ndarray] = {}
-    q: list[np.ndarray] = []
-    v: list[np.ndarray] = []
-    a: list[np.ndarray] = []
-    u: list[np.ndarray] = []
-    t: list[np.ndarray] = []
+    each: list[list[np.ndarray]] = []
     for track in model.tracks:
         m = model.motion(track)
-        mean = track.bumps.mean
-        for into, value in ((q, m.q), (v, m.v), (a, m.vd), (u, m.effort)):
-            into.append(mean(value))
-        t.append(track.bumps.centre)
-    for i, joint in enumerate(model.joints):
-        features[f"the position of {joint}"] = np.concatenate(q)[:, i]
-        features[f"the velocity of {joint}"] = np.concatenate(v)[:, i]
-        features[f"the acceleration of {joint}"] = np.concatenate(a)[:, i]
-        features[f"the effort of {joint}"] = np.concatenate(u)[:, i]
-    features["time"] = np.concatenate(t)
-    out = []
-    for k, (what, joint) in enumerate(names):
-        size = float(np.sqrt(np.mean(R[:, k] ** 2)))
-        if size < least:
-            continue
-        shares = {n: _explained_share(x, R[:, k]) for n, x in features.items()}
-        best = max(shares, key=lambda n: shares[n])
-        text = (
-            f"{best} (it explains {shares[best]:.0%} of its variance)"
-            if shares[best] > 0.2
-            else "nothing that is measured"
+        motion = [track.bumps.mean(x) for x in (m.q, m.v, m.vd, m.effort)]
+        each.append([*motion, track.bumps.centre])
+    *motion, time = (np.concatenate(x) for x in zip(*each, strict=True))
+    features = {
+        f"the {what} of {joint}": x[:, i]
+        for i, joint in enumerate(model.joints)
+        for what, x in zip(
+            ("position", "velocity", "acceleration", "effort"), motion, strict=True
         )
+    }
+    features["time"] = time
+    R = left.reshape(-1, len(names))
+    found = []
+    for k, (what, joint) in enumerate(names):
+        size, goes, best = _goes_with(R[:, k], features)
+        if size < LOUD:
+            continue
         since = None
-        if best == "time" and shares[best] > 0.2 and len(model.recordings) == 1:
-            since = jump_time(features["time"], R[:, k])
-        out.append(Unexplained(f"{joint}.{what}", "everywhere", size, text, since))
-    return sorted(out, key=lambda each: -each.size)
+        if best == "time" and len(model.recordings) == 1:
+            since = jump_time(time, R[:, k])
+        found.append(Unexplained(f"{joint}.{what}", "everywhere", size, goes, since))
+    return sorted(found, key=lambda each: -each.size)
+
+
+def unexplained_in_windows(
+    model: Any, simulated: Sequence[np.ndarray]
+) -> list[Unexplained]:
+    """Of each channel what is left, while what, and what its size goes with."""
+    errors = model.errors(simulated)
+    used = [
+        k for k, e in enumerate(errors) if len(e) and not np.isinf(simulated[k]).any()
+    ]
+    if not used:
+        return []
+    features: dict[str, list[np.ndarray]] = {}
+    for k in used:
+        w = model.windows[k]
+        recording = model.recordings[w.recording]
+        time = recording.time[w.rows]
+        features.setdefault("time since the window's start", []).append(time - w.start)
+        for c in model.channels:
+            if c.rsplit(".", 1)[-1] in ("x", "y", "z", "position"):
+                y = recording[c][w.rows]
+                good = np.isfinite(y)
+                if good.sum() < 2:
+                    y, good = np.zeros(len(time)), np.ones(len(time), bool)
+                y = np.interp(time, time[good], y[good])
+                features.setdefault(f"the value of {c}", []).append(y)
+                rate = np.gradient(y, time)
+                features.setdefault(f"the rate of {c}", []).append(rate)
+    joined = {what: np.concatenate(x) for what, x in features.items()}
+    E = np.concatenate([errors[k] for k in used])
+    found = []
+    for i, name in enumerate(model.channels):
+        size, goes, _ = _goes_with(E[:, i], joined)
+        if size < LOUD:
+            continue
+        worst = max(used, key=lambda k: float(np.mean(errors[k][:, i] ** 2)))
+        w = model.windows[worst]
+        region = f"most in episode {w.episode}, from {w.start:.3g} s"
+        found.append(Unexplained(name, region, size, goes))
+    return sorted(found, key=lambda each: -each.size)
+
+
+def _goes_with(
+    y: np.ndarray, features: Mapping[str, np.ndarray]
+) -> tuple[float, str, str]:
+    """Rms of y (n,), what explains most of its variance, in words, and that feature
+    (n,) alone; "" where none explains a fifth."""
+    shares = {what: share_explained(x, y) for what, x in features.items()}
+    best = max(shares, key=lambda what: shares[what])
+    size = float(np.sqrt(np.mean(y**2)))
+    if shares[best] <= EXPLAINED:
+        return size, "nothing that is measured", ""
+    return size, f"{best} (it explains {shares[best]:.0%} of its variance)", best
 
 
 def jump_time(t: np.ndarray, y: np.ndarray) -> float | None:
@@ -178,19 +222,17 @@ def begins(
     return found
 
 
-def _explained_share(x, y, bins: int = 12) -> float:
-    """Share of y's variance between bins of x, less what chance gives."""
-    if np.std(x) == 0.0 or np.std(y) == 0.0:
+def share_explained(x: np.ndarray, y: np.ndarray) -> float:
+    """Share of the variance of y (n,) that its mean in bins of x (n,) tells, less what
+    chance gives."""
+    if np.std(x) == 0.0 or np.std(y) == 0.0 or len(y) <= BINS:
         return 0.0
-    edges = np.quantile(x, np.linspace(0, 1, bins + 1)[1:-1])
+    edges = np.quantile(x, np.linspace(0, 1, BINS + 1)[1:-1])
     group = np.searchsorted(edges, x)
-    within = 0.0
-    for g in range(bins):
-        part = y[group == g]
-        if len(part):
-            within += np.sum((part - part.mean()) ** 2)
-    n = len(y)
-    return float(1.0 - within / (n - bins) / np.var(y, ddof=1)) if n > bins else 0.0
+    count = np.bincount(group, minlength=BINS)
+    mean = np.bincount(group, y, minlength=BINS) / np.maximum(count, 1)
+    within = float(np.sum((y - mean[group]) ** 2))
+    return 1.0 - within / (len(y) - BINS) / float(np.var(y, ddof=1))
 
 
 def _rate(channel: str, y: np.ndarray, time: np.ndarray) -> tuple[np.ndarray, str]:
