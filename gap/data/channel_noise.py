@@ -67,7 +67,4 @@ def noise_told(
         std = max(own.std, given / np.sqrt(channel.averaged))
     elif given > 0.0:
         std, source = max(given, own.step / np.sqrt(12.0)), "given"
-    return replace(
-        channel, noise=std, noise_from=source, noise_pole=own.pole, step=own.step,
-        rate_hz=rate,
-    )  # fmt: skip
+    return replace(channel, noise=std, noise_from=source, step=own.step, rate_hz=rate)

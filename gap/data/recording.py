@@ -34,7 +34,6 @@ class Channel:
     noise: standard deviation, in the channel's unit; for a command 0.
     noise_from: "given", "estimated", or "none" for a command. noise_given: of a single
     sample as the sidecar says it, else 0. averaged: samples in each value, as a mean.
-    noise_pole: 0 for white noise; else the estimated pole of its filter, a sample.
     together: how many neighbouring samples' noise goes together, 1 for white noise.
     step: the channel's resolution if it is quantised, else 0.
     rate_hz: samples that are there per second. filter: what the sidecar says.
@@ -48,7 +47,6 @@ class Channel:
     noise_from: str = "none"
     noise_given: float = 0.0
     averaged: float = 1.0
-    noise_pole: float = 0.0
     together: float = 1.0
     step: float = 0.0
     rate_hz: float = 0.0

@@ -47,9 +47,8 @@ class Choice:
     that a fit chooses. in_group: one of several places of its kind that were added at
     once. of_two: it and its rival are both needed. paired: it was added at once with an
     effect of another kind. or_more: parameters that may as well be any larger.
-    needed_beside: (kind, place) of rivals
-    beside which it is needed, so that they are no ties. sets: others that explain as
-    much in the place of it and another one.
+    needed_beside: (kind, place) of rivals beside which it is needed, so that they are
+    no ties.
     """
 
     effect: Effect
