@@ -34,11 +34,6 @@ from makebreak.gap.residuals.permitted_contacts import Shift
 from makebreak.gap.residuals.pose_times import earlier
 from makebreak.gap.residuals.touching import ROBUST
 from makebreak.gap.residuals.where import unexplained_in_windows, where_in_windows
-from makebreak.gap.residuals.widened_contacts import (
-    distances_off,
-    sentence,
-    widened_contacts,
-)
 from makebreak.gap.residuals.wrench_sensor import WrenchSensor, felt_motion
 from makebreak.gap.result import InUnits, Where
 from makebreak.gap.simulation.contact_windows import (
@@ -498,13 +493,27 @@ class ContactProblem(ContactCandidates, GapProblem):
         return said
 
     def hint(self, end: Fitted) -> str:
-        """What a camera's clock would explain; else which pair would have to press
-        otherwise, and how."""
-        if late := self.late_poses(end):  # All else may follow from it.
-            return "".join(late)
-        now, found = widened_contacts(self, end, AGREEMENT_RMS_MAX)
-        off = distances_off(self, end, self.plan.loud)
-        return "".join(off) + sentence(now, found)
+        """What a camera's clock would explain; else which shapes that press on each
+        other are apart."""
+        # All else may follow from a clock.
+        return "".join(self.late_poses(end) or self.distances_off(end))
+
+    def distances_off(self, end: Fitted) -> list[str]:
+        """Of pairs whose shapes are apart, or in one another, by more than a channel
+        may be loud: how much, in words."""
+        names, of_rows, said = self.row_names(), self.channel_of_rows(), []
+        for pair in self._pairs_met:
+            name = self.pair_name(pair)
+            left = end.left[of_rows == names.index(f"{name}.distance")]
+            if len(left) < FEWEST_ROWS or rms(left) <= self.plan.loud:
+                continue
+            d = -1e3 * float(np.median(left)) * self.distance_std(pair)
+            how = "apart" if d > 0.0 else "inside one another"
+            said.append(
+                f" Where {name} press on each other, the scene's shapes are "
+                f"{abs(d):.2g} mm {how}."
+            )
+        return said
 
     def _blocks_left(self, left: np.ndarray) -> list[tuple[float, int]]:
         """Rms of rows (m,) and number of each block that has enough of them. Of a row

@@ -411,7 +411,7 @@ class PressingProblem(FeltPlaces):
         return pressed_with_corners(self, touching)
 
     def hint(self, end: Fitted) -> str:
-        """None: where what is fixed stands is felt, and is not widened beside that."""
+        """None: where what is fixed stands is felt, and is fitted."""
         return ""
 
     def _friction_now(self, pair) -> float:

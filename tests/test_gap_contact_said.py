@@ -1,4 +1,4 @@
-"""Where to look for what no effect explains, and what SAP makes of friction."""
+"""What is said of contacts beside what is named: distances, bounds of friction, SAP."""
 
 from dataclasses import replace
 
@@ -10,20 +10,12 @@ from push_problems import screen_of
 
 from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.fit import fit_effects
-from makebreak.gap.numerics.permitted_forces import tangents
 from makebreak.gap.problem import Fitted
 from makebreak.gap.residuals.contact_candidates import FRICTION_SPREAD
 from makebreak.gap.residuals.contact_problem import ContactProblem
 from makebreak.gap.residuals.sap_lift import sap_lift
-from makebreak.gap.residuals.widened_contacts import (
-    distances_off,
-    sentence,
-    widened_contacts,
-    widened_slots,
-)
 from makebreak.gap.result import GapMeasure
 from makebreak.gap.search.comparison import Comparison
-from makebreak.gap.thresholds import AGREEMENT_RMS_MAX
 from makebreak.gap.verdict import two_figures
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
@@ -57,43 +49,9 @@ def tip_pair(problem: ContactProblem) -> str:
     return name
 
 
-def test_where_nothing_is_left_nothing_is_said(problem):
-    now, found = widened_contacts(problem, started(problem), AGREEMENT_RMS_MAX)
-    assert (
-        now < AGREEMENT_RMS_MAX and found == [] and problem.hint(started(problem)) == ""
-    )
-
-
-def test_a_force_off_its_normal_is_said_of_its_pair_by_how_much(problem, monkeypatch):
-    """The tip's force tilts by 7 degrees more than friction lets it."""
-    wrench = problem.means.wrench.copy()
-    across = np.linalg.norm(wrench[:, :2], axis=1)
-    (slot,) = [s for s in problem.slots if problem.pair_name(problem._pair_of(s))
-               == tip_pair(problem)][:1]  # fmt: skip
-    wrench[:, 2] = across * np.tan(np.arctan(slot.friction) + np.radians(7.0))
-    monkeypatch.setattr(problem.means, "wrench", wrench)
-    now, found = widened_contacts(problem, started(problem), AGREEMENT_RMS_MAX)
-    assert found[0].pair == tip_pair(problem) and found[0].unit == "degrees"
-    # Of 2, 5, 10 and 20 degrees one that holds 7; some is left, as what the table
-    # carries, and its friction, was not changed with it.
-    assert found[0].size in (10.0, 20.0) and found[0].left < 0.25 * now
-
-
-def test_a_force_beside_where_shapes_meet_is_said_of_its_pair(problem, monkeypatch):
-    """The block's moment is that of a contact 6 mm aside."""
-    push = np.linalg.norm(problem.means.wrench[:, :2], axis=1)
-    needs = problem._needs.copy()
-    needs[:, problem.bodies[BLOCK][1] + 2] += 6e-3 * push
-    monkeypatch.setattr(problem, "_needs", needs)
-    _, found = widened_contacts(problem, started(problem), AGREEMENT_RMS_MAX)
-    best = [w for w in found if w.pair == tip_pair(problem) and w.unit == "mm"]
-    assert best and best[0].size == 8.0 and best[0].left < AGREEMENT_RMS_MAX
-    assert tip_pair(problem) in sentence(2.0, best)
-
-
 def test_a_block_seen_beside_the_tip_is_said_in_millimetres(problem, monkeypatch):
     start = started(problem)
-    assert distances_off(problem, start, problem.plan.loud) == []
+    assert problem.hint(start) == ""
     names, rows = problem.row_names(), problem.channel_of_rows()
     pair = next(p for p in problem._pairs_met
                 if problem.pair_name(p) == tip_pair(problem))  # fmt: skip
@@ -101,25 +59,8 @@ def test_a_block_seen_beside_the_tip_is_said_in_millimetres(problem, monkeypatch
     left = start.left.copy()
     # Rows are what is wanted (none) less the distance, over what it is known to.
     left[mine] -= 1.5e-3 / problem.distance_std(pair)
-    (said,) = distances_off(problem, replace(start, left=left), problem.plan.loud)
+    said = problem.hint(replace(start, left=left))
     assert tip_pair(problem) in said and "1.5 mm apart" in said
-
-
-def test_slots_are_turned_and_moved_by_what_is_said(problem):
-    slot = problem.slots[0]
-    turned = widened_slots([slot], 10.0, "degrees")
-    for s in turned:
-        cosine = np.sum(s.normal * slot.normal, axis=1)
-        np.testing.assert_allclose(cosine, np.cos(np.radians(10.0)), atol=1e-12)
-    # The four lie about the old one.
-    mean = np.mean([s.normal for s in turned], axis=0)
-    np.testing.assert_allclose(np.cross(mean, slot.normal), 0.0, atol=1e-12)
-    for s in widened_slots([slot], 3.0, "mm"):
-        off = s.place - slot.place
-        np.testing.assert_allclose(np.linalg.norm(off, axis=1), 3e-3, atol=1e-12)
-        np.testing.assert_allclose(np.sum(off * slot.normal, axis=1), 0.0, atol=1e-12)
-    for e in tangents(slot.normal):
-        np.testing.assert_allclose(np.sum(e * slot.normal, axis=1), 0.0, atol=1e-12)
 
 
 def test_a_gap_of_equations_alone_is_said_with_its_size():
