@@ -18,6 +18,10 @@ from makebreak.gap.data.recording import Episode, Recording
 FEWEST = 20  # Changes that tell a clock.
 SLACK = 0.05  # Of a row: by how much stamps may be off.
 MOVED = 0.05  # Of a row: what is less, on average, needs no rows.
+# Commands that change in so many of the rows, and come within so much of half a row
+# sooner than these, are samples of a faster loop; in steps no shorter than this [s].
+EACH_ROW, HALF_WAY, STEP_SEC = 0.5, 0.2, 0.002
+LONGEST = 1.5  # Rows in which a command goes to its next sample: there is one missing.
 _OFF = 0.004  # Share by which the mean between changes may be off a period.
 _FARTHER = 1.25  # Times as far ticks are counted at a time.
 _AT_FIRST = 200  # Changes of which ticks are counted at first.
@@ -45,10 +49,10 @@ def _on_clock_of(
     instants = [_instants(recording, e, names) for e in recording.episodes]
     known = [x for x in instants if x is not None]
     row = recording.period_sec()
-    late = np.concatenate([np.zeros(0), *(at - sooner for at, sooner in known)])
+    late = np.concatenate([np.zeros(0), *(at - sooner for at, sooner, _ in known)])
     if not np.sum(late) > MOVED * row * len(late):
         return recording, []
-    period = float(np.median(np.concatenate([np.diff(t) for _, t in known])))
+    period = float(np.median(np.concatenate([np.diff(t) for _, t, _ in known])))
     says = (
         f"The commands of {recording.path.name} change every {1e3 * period:.4g} ms or "
         f"a multiple of it, and its rows, {1e3 * row:.3g} ms apart, show that up to "
@@ -60,16 +64,32 @@ def _on_clock_of(
 
 
 def moved_sooner(recordings: Sequence[Recording], early: float) -> list[Recording]:
-    """The recordings with positions and velocities commanded so much sooner [s]."""
-    out = []
-    for r in recordings:
-        names = [c.name for c in r.commands() if c.quantity != "effort_command"]
-        instants = []
-        for episode in r.episodes:
-            at = r.time[episode.rows][_changed(r, episode, names)]
-            instants.append((at, at - early))
-        out.append(_with_rows(r, names, instants))
-    return out
+    """The recordings with positions and velocities commanded so much sooner [s]. Those
+    of a loop that is p times as fast as the rows come (p - 1)/(2 p) of a row sooner
+    than if they held for it: they go from sample to sample in p steps."""
+    return [_sooner(r, early) for r in recordings]
+
+
+def _sooner(r: Recording, early: float) -> Recording:
+    names = [c.name for c in r.commands() if c.quantity != "effort_command"]
+    row = r.period_sec()
+    changed = [_changed(r, episode, names) for episode in r.episodes]
+    apart = np.concatenate([np.zeros(0), *(np.diff(k) for k in changed)])
+    share, parts = early / row, 1
+    if len(apart) and np.mean(apart == 1) > EACH_ROW and abs(share - 0.5) < HALF_WAY:
+        faster = 1.0 / max(1.0 - 2.0 * share, 1e-6)
+        parts = max(round(min(faster, row / STEP_SEC)), 1)
+    # The first of the steps from one sample to the next comes with the loop's period.
+    off = early - 0.5 * row * (1.0 - 1.0 / parts)
+    steps = np.arange(1, parts + 1) / parts
+    instants = []
+    for episode, k in zip(r.episodes, changed, strict=True):
+        time = r.time[episode.rows]
+        since = np.minimum(time[k] - time[k - 1], LONGEST * row)
+        sooner = time[k, None] - since[:, None] * (1.0 - steps) - off
+        instants.append((np.repeat(time[k], parts), sooner.ravel(),
+                         np.tile(steps, len(k))))  # fmt: skip
+    return _with_rows(r, names, instants)
 
 
 def ticks(before: np.ndarray, after: np.ndarray) -> np.ndarray | None:
@@ -138,14 +158,14 @@ def changes(held: np.ndarray) -> np.ndarray:
 
 
 def _instants(recording: Recording, episode: Episode, names: Sequence[str]):
-    """(the rows' times at which commands changed, when they did) (n,) each; None where
-    that is not known better."""
+    """(the rows' times at which commands changed, when they did, and which share of the
+    change they did) (n,) each; None where that is not known better."""
     time = recording.time[episode.rows]
     if not names or len(time) < 3:
         return None
     changed = _changed(recording, episode, names)
     found = ticks(time[changed - 1], time[changed])
-    return None if found is None else (time[changed], found)
+    return None if found is None else (time[changed], found, np.ones(len(found)))
 
 
 def _changed(recording: Recording, episode: Episode, names: Sequence[str]):
@@ -156,12 +176,12 @@ def _changed(recording: Recording, episode: Episode, names: Sequence[str]):
 
 def _with_rows(recording: Recording, names: Sequence[str], instants) -> Recording:
     """The recording with rows of these commands alone at the instants at which they
-    changed."""
-    times, rows, told, episodes, own = [], [], [], [], []
+    changed, or a share of a change was done."""
+    times, rows, told, shares, episodes, own = [], [], [], [], [], []
     first = 0
     for episode, found in zip(recording.episodes, instants, strict=True):
         time = recording.time[episode.rows]
-        at, sooner = (np.zeros(0), np.zeros(0)) if found is None else found
+        at, sooner, share = (np.zeros(0),) * 3 if found is None else found
         new = at - sooner > 1e-6 * recording.period_sec()
         every = np.concatenate([time, sooner[new]])
         changed = np.searchsorted(time, at)
@@ -174,14 +194,18 @@ def _with_rows(recording: Recording, names: Sequence[str], instants) -> Recordin
         told.append(
             episode.first + np.append(0, changed)[last] if len(at) else rows[-1]
         )
+        shares.append(np.append(1.0, share)[last])
         own.append(order < len(time))
         episodes.append(replace(episode, first=first, last=first + len(every)))
         first += len(every)
-    shown, measured, acts = map(np.concatenate, (rows, own, told))
+    shown, measured, acts, done = map(np.concatenate, (rows, own, told, shares))
     moved = {}
     for name, channel in recording.channels.items():
         if name in names:
-            values = recording.held(name)[acts]
+            held = recording.held(name)
+            values = held[acts]
+            part = done < 1.0
+            values[part] += (1.0 - done[part]) * (held[acts[part] - 1] - values[part])
         else:
             values = np.where(measured, channel.values[shown], np.nan)
         values.setflags(write=False)

@@ -287,8 +287,10 @@ def _blocks(recording: Recording, episode: Episode, length: float, fast):
         return {"time": np.zeros(0)}
     time = recording.time[episode.rows]
     starts = time[0] + length * np.arange(n)
-    middles = starts + 0.5 * length
-    block = np.minimum(((time - time[0]) / length).astype(int), n)
+    # Of the samples: what is on a line through them elsewhere is off by what repeats
+    # in every block, as with each new command.
+    middles = starts + 0.5 * (length - recording.period_sec())
+    block = np.minimum(((time - time[0]) / length + 1e-6).astype(int), n)
     slow = [
         c for c in recording.measured() if c.name not in fast
     ]  # Each at its own stamps.

@@ -148,17 +148,21 @@ def _widened(bad, margin):
 
 
 def _coarse_lag(y, x, good, most):
-    """The shift of x [samples] with which it correlates best with y, of either sign."""
-    y = np.where(good, y - y[good].mean(), 0.0)
-    x = np.where(good, x - x[good].mean(), 0.0)
-    n = len(y)
-    size = 1 << int(np.ceil(np.log2(2 * n)))
-    product = np.fft.rfft(y, size) * np.conj(np.fft.rfft(x, size))
-    correlation = np.fft.irfft(product, size)
-    most = min(most, n // 3)
+    """The shift of x [samples] with which it correlates best with y, of either sign.
+    Of where both are good at that shift: by the power of all, slow motion that grows
+    would correlate best far off."""
+    size = 1 << int(np.ceil(np.log2(2 * len(y))))
+    most = min(most, len(y) // 3)
     shifts = np.arange(-most, most + 1)
-    # The overlap shrinks with the shift.
-    return int(shifts[np.argmax(np.abs(correlation[shifts]) / (n - np.abs(shifts)))])
+
+    def correlated(a, b):
+        product = np.fft.rfft(a, size) * np.conj(np.fft.rfft(b, size))
+        return np.fft.irfft(product, size)[shifts]
+
+    y, x = (np.where(good, z - z[good].mean(), 0.0) for z in (y, x))
+    power = correlated(y * y, good) * correlated(good, x * x)
+    share = np.abs(correlated(y, x)) / np.sqrt(np.maximum(power, 1e-12 * power.max()))
+    return int(shifts[np.argmax(share)])
 
 
 def _fit(clock, y, curves, good, lag, width, steps=8):

@@ -98,11 +98,16 @@ class MechanismMotion:
         self.noise = self._noise("position")
         self.velocity_noise = self._noise("velocity")
         # Root of how many neighbouring samples of a velocity err together.
+        rates = [
+            [r.channels[c] for r in recordings if c in r]
+            for c in (f"{joint}.velocity" for joint in self.joints)
+        ]
         self._together = np.sqrt(
-            [
-                max((r.channels[c].together for r in recordings if c in r), default=1.0)
-                for c in (f"{joint}.velocity" for joint in self.joints)
-            ]
+            [max((c.together for c in some), default=1.0) for some in rates]
+        )
+        # In each value of a velocity, as a mean.
+        self._averaged = np.array(
+            [min((c.averaged for c in some), default=1.0) for some in rates]
         )
         self.effort_noise = self._noise("effort_measured")
 

@@ -27,7 +27,7 @@ OTHERS = ("velocity", "effort_measured")  # Channels that are compared beside.
 # where no friction is known, as uncertainty, by the share of time at rest.
 REST_SPEED, REST_SHARE, REST_EFFORT = 0.005, 0.04, 0.3
 # Sampled at the very instants at which a stiff drive gets new commands, a velocity is
-# off by a share of itself.
+# off by a share of itself; means over more samples by less.
 DRIVE_VELOCITY = 0.01
 MODEL_ERROR = 2e-4  # Of a joint's rms effort: what smoothing and sampling leave.
 LEAST_EFFORT = 0.1  # Of a joint, as a share of the largest joint's: rms.
@@ -115,7 +115,8 @@ class WhitenedRows(MechanismMotion):
         # The smoothed velocity's own error, as over one bump.
         own = self.noise * np.sqrt(period * 12.0 / track.bumps.width**3)
         v_std = np.hypot(self.velocity_noise * g_v * self._together, own)
-        v_std = np.hypot(v_std, np.where(kd > 0.0, DRIVE_VELOCITY * rms_of(v), 0.0))
+        swing = DRIVE_VELOCITY * rms_of(v) / self._averaged
+        v_std = np.hypot(v_std, np.where(kd > 0.0, swing, 0.0))
         return {
             "effort": C,
             "held": held,

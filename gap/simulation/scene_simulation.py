@@ -22,6 +22,7 @@ from makebreak.gap.simulation.sensor_samples import (
     instants,
     samples_at,
     stages_of,
+    with_middles,
 )
 from makebreak.gap.simulation.stand_on_ground import stand_on_ground
 from makebreak.models.effects import KINDS
@@ -206,11 +207,18 @@ class SceneSimulation:
         out = np.empty((len(times), len(channels)))
         motions: dict = {}
         for i, channel in enumerate(channels):
-            value = self._channels.true_values(channel, x, effort, motions)
+            known, value = (
+                needed,
+                self._channels.true_values(channel, x, effort, motions),
+            )
             if channel in stages:
+                place = f"{channel.rpartition('.')[0]}.position"
+                if channel.endswith(".velocity") and place in self._channels:
+                    position = self._channels.true_values(place, x, effort, motions)
+                    known, value = with_middles(needed, position, value)
                 past = (before or {}).get(channel)
-                value = behind(stages[channel], needed, value, past)
-            column = samples_at(shown.get(channel, times), needed, value, start)
+                value = behind(stages[channel], known, value, past)
+            column = samples_at(shown.get(channel, times), known, value, start)
             m = maps.get(channel)
             out[:, i] = column if m is None else m.scale * column + m.bias
         return out

@@ -65,6 +65,22 @@ def behind(
     return filtered(stages, t, x)[int(since.sum()) :]
 
 
+def with_middles(
+    times: np.ndarray, position: np.ndarray, velocity: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Times (2 m - 1,) and velocities with one between each two, so that their integral
+    is what the position (m,) has: between them a drive that gets a new command swings.
+    """
+    h = np.diff(times)
+    mean = 0.5 * (velocity[1:] + velocity[:-1])
+    long = h > 1e-6
+    rate = np.where(long, np.diff(position) / np.where(long, h, 1.0), mean)
+    fine, values = np.empty(2 * len(times) - 1), np.empty(2 * len(times) - 1)
+    fine[::2], fine[1::2] = times, times[:-1] + 0.5 * h
+    values[::2], values[1::2] = velocity, 2.0 * rate - mean
+    return fine, values
+
+
 def samples_at(
     at: np.ndarray, times: np.ndarray, values: np.ndarray, start: float
 ) -> np.ndarray:

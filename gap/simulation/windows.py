@@ -19,6 +19,7 @@ from makebreak.gap.data.recording import Episode, Recording
 from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.numerics.growth import spread_along
 from makebreak.gap.numerics.signal_noise import jump_variance
+from makebreak.gap.numerics.stairs import beside_line
 from makebreak.gap.numerics.struck import struck_rows
 from makebreak.gap.simulation.channel_effects import (
     given_late,
@@ -28,6 +29,7 @@ from makebreak.gap.simulation.channel_effects import (
 )
 from makebreak.gap.simulation.commands import Commands
 from makebreak.gap.simulation.scene_simulation import SceneSimulation
+from makebreak.models.drives import law_of
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
@@ -361,6 +363,7 @@ class WindowModel(WindowedResidual):
                 after = time[rows] - t0
                 std = np.empty((len(after), len(self.channels)))
                 state = {n: x[start_row] for n, x in states.items()}
+                self._beside_line(recording, episode, t0, state)
                 grown = self._grown(recording, states, spreads, rows, after, jumps)
                 # No less than along a straight line: behind filters a smoothed state is
                 # less sure than it knows, also where the motion makes little of it.
@@ -382,6 +385,34 @@ class WindowModel(WindowedResidual):
                     )
                 )  # fmt: skip
             start_row = max(int(np.searchsorted(time, t0 + hop)), start_row + 1)
+
+    def _beside_line(self, recording, episode, t0: float, state) -> None:
+        """Adds to a window's start {signal: (value, rate, accel.)} what a smoothed
+        motion does not show of drives that get commands in stairs."""
+        plant = self.dynamics.plant
+        laws = {j: law_of(self.scene.actuation, j) for j in self.joints}
+        driven = [
+            j for j, law in laws.items()
+            if law and f"{j}.position_command" in recording
+        ]  # fmt: skip
+        joints = _velocity_starts(plant)
+        if not driven or set(joints) != set(self.joints):
+            return
+        n = len(joints)
+        kp, kd, q = np.zeros(n), np.zeros(n), np.zeros(n)
+        time = recording.time[episode.rows]
+        held = np.zeros((len(time), n))
+        for name, i in joints.items():
+            q[i] = state[f"{name}.position"][0]
+        for name in driven:
+            i, law = joints[name], laws[name]
+            kp[i], kd[i] = float(law.kp), float(law.kd)
+            held[:, i] = recording.held(f"{name}.position_command")[episode.rows]
+        mass = self.dynamics.momentum(np.tile(q, (n, 1)), np.eye(n))
+        dq, dv = beside_line(np.linalg.inv(mass), kp, kd, time, held, t0)
+        for name, i in joints.items():
+            key = f"{name}.position"
+            state[key] = state[key] + np.array([dq[i], dv[i], 0.0])
 
     def _best_start(self, time, states, row: int) -> int:
         """The row at or soon after one at which a window begins."""
