@@ -43,6 +43,7 @@ def test_a_long_rest_before_stairs_is_no_step():
     assert np.abs(dq).max() < 1e-3 and np.abs(dv).max() < 0.1
     none = beside_line(np.eye(1), np.ones(1), np.ones(1), time, held, 1.0)
     assert not np.any(none)  # Too little is known of what was before.
+    assert not np.any(beside_line(np.eye(1), *np.ones((2, 1)), time[:0], held[:0], 1.0))
 
 
 @pytest.mark.parametrize("start", [0.0, 7.3])

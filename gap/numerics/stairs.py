@@ -32,7 +32,8 @@ def beside_line(
         (m,) instants [s] from which commands held (m, n) hold.
     """
     n, none = len(kp), (np.zeros(len(kp)), np.zeros(len(kp)))
-    moves = np.append(True, np.any(held[1:] != held[:-1], axis=1))
+    moves = np.ones(len(time), bool)
+    moves[1:] = np.any(held[1:] != held[:-1], axis=1)
     since = time[moves]
     first, last = np.searchsorted(since, at, "right") - 1 - STEPS, len(since)
     if first < 0 or last - first < STEPS + 3:

@@ -341,20 +341,20 @@ class InverseModel(WhitenedRows):
     def filter_timing(self) -> tuple[list[np.ndarray], list[float], list[str]]:
         """Columns (m,) of the residual, standard deviations [s] and names of what is
         not known of velocities: at which instant of a row's period they were computed,
-        those with a filter of their own each by itself, all others together. (Differences
-        of positions are half a row late, a simulator's velocities half a step.) Any
-        instant within half a period is as likely as another."""
+        those with a filter of their own each by itself, all others together.
+        (Differences of positions are half a row late, a simulator's velocities half a
+        step.) Any instant within half a period is as likely as another."""
         columns, names = [], []
         filtered_too: list[int] = []
         others: list[int] = []
         for i, joint in enumerate(self.joints):
             if self.has["velocity"][i]:
-                own = any(
+                has_own = any(
                     track.stages[f"{joint}.velocity"]
                     != track.stages[f"{joint}.position"]
                     for track in self.tracks
                 )
-                (filtered_too if own else others).append(i)
+                (filtered_too if has_own else others).append(i)
         for some in (*([i] for i in filtered_too), others):
             if not some:
                 continue

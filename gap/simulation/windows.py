@@ -390,13 +390,13 @@ class WindowModel(WindowedResidual):
         """Adds to a window's start {signal: (value, rate, accel.)} what a smoothed
         motion does not show of drives that get commands in stairs."""
         plant = self.dynamics.plant
-        laws = {j: law_of(self.scene.actuation, j) for j in self.joints}
-        driven = [
-            j for j, law in laws.items()
-            if law and f"{j}.position_command" in recording
-        ]  # fmt: skip
+        laws = {
+            j: law for j in self.joints
+            if f"{j}.position_command" in recording
+            and (law := law_of(self.scene.actuation, j)) is not None
+        }  # fmt: skip
         joints = _velocity_starts(plant)
-        if not driven or set(joints) != set(self.joints):
+        if not laws or set(joints) != set(self.joints):
             return
         n = len(joints)
         kp, kd, q = np.zeros(n), np.zeros(n), np.zeros(n)
@@ -404,12 +404,13 @@ class WindowModel(WindowedResidual):
         held = np.zeros((len(time), n))
         for name, i in joints.items():
             q[i] = state[f"{name}.position"][0]
-        for name in driven:
-            i, law = joints[name], laws[name]
+        for name, law in laws.items():
+            i = joints[name]
             kp[i], kd[i] = float(law.kp), float(law.kd)
             held[:, i] = recording.held(f"{name}.position_command")[episode.rows]
         mass = self.dynamics.momentum(np.tile(q, (n, 1)), np.eye(n))
-        dq, dv = beside_line(np.linalg.inv(mass), kp, kd, time, held, t0)
+        told = np.isfinite(held).all(axis=1)
+        dq, dv = beside_line(np.linalg.inv(mass), kp, kd, time[told], held[told], t0)
         for name, i in joints.items():
             key = f"{name}.position"
             state[key] = state[key] + np.array([dq[i], dv[i], 0.0])
