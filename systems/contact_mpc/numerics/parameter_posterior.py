@@ -268,6 +268,14 @@ def normals(lcs: LCS) -> np.ndarray:
     return same @ J / np.maximum(same.sum(axis=1), 1)[:, None]
 
 
+def nearest(lcs: LCS, sample: Sample) -> np.ndarray:
+    """(n_lam,) the smaller of a contact's two measured gaps at the ends of the step,
+    over its time [m/s]; zero where w holds no gap."""
+    _, phi, _ = pushes(lcs)
+    gap = np.where(np.isfinite(phi), phi, 0.0) / lcs.dt
+    return gap - 0.5 * abs(normals(lcs) @ sample.v_mean)
+
+
 def explain(lcs: LCS, sample: Sample, loss: Loss) -> Explained | None:
     """The forces of the violation-based loss; None where its QP was not solved."""
     z, q = step_of(lcs, sample)
@@ -339,8 +347,8 @@ def gradient_and_information(
     told = _unexplained(of_z, of_z[:, noise])
     gradient, of_z = gradient + (told - of_z).T @ missed, told
     # A force at a distance stands for what the model lacks, and tells of gaps alone.
-    far = BEYOND_NOISE * np.sqrt(loss.eps * loss.gamma) * found.acting.rows.sum(axis=0)
-    noise = noise | (dx.any(axis=0) & (found.eta > far)[found.f > 0.0].any())
+    far = nearest(found.lcs, sample) > BEYOND_NOISE * np.sqrt(loss.eps * loss.gamma)
+    noise = noise | (dx.any(axis=0) & far[found.lam > 0.0].any())
     gradient, of_z = np.where(noise, 0.0, gradient), np.where(noise, 0.0, of_z)
     return gradient, of_z.T @ of_z
 
