@@ -436,6 +436,40 @@ def test_a_place_goes_along_with_what_rolls_and_not_with_its_noise(planner):
         assert lag < 0.003 if follow else lag > 0.006
 
 
+def at_a_good_place(planner, goal, spec=T):
+    """A state with the tip where it is best for a goal, and the target."""
+    pose, (model, problem, shape) = (0.5, 0.0, 0.3), planner
+    x = state([0.3, 0.0, 0.1], pose, spec)
+    x_desired = target(x, goal, problem.options.N + 1)
+    memory, _ = sample_round(
+        SamplingConfig(), SamplingMemory(), model.build_many, problem, shape, x,
+        x_desired, 0.1, False, 0.0,
+    )  # fmt: skip
+    at = state([*to_world(x, memory.place), HEIGHT], pose, spec)
+    return at, target(at, goal, problem.options.N + 1)
+
+
+@pytest.mark.parametrize("goal", [(0.45, 0.06, 0.0), (0.5, -0.06, 0.8)])
+def test_a_tip_that_pushes_keeps_the_plan_that_it_pushes_by(goal):
+    """It looked for one from nothing, of which noise made the cost three and five times
+    as large, and so left what it had just touched."""
+    spec, rng = PushedObject("box"), np.random.default_rng(0)
+    model, problem, shape = own = planner_of(spec)
+    at, x_desired = at_a_good_place(own, goal, spec)
+    config = SamplingConfig(places=1, change=ChangeConfig(hysteresis=[0.0, 1e9]))
+    memory, costs = SamplingMemory(), []
+    for _ in range(20):
+        x = at.copy()
+        x[P_TIP][:2] += 1e-3 * rng.normal(size=2)
+        x[V_BALL][:2] += 0.02 * rng.normal(size=2)
+        memory, found = sample_round(
+            config, memory, model.build_many, problem, shape, x, x_desired, 0.1, True,
+            0.0,
+        )  # fmt: skip
+        costs.append(found.cost[0])
+    assert found.chosen == 0 and max(costs[1:]) < 1.25 * min(costs)
+
+
 @pytest.mark.parametrize("shape", ["disc", "cylinder"])
 def test_a_place_keeps_the_plan_that_it_was_chosen_for(shape):
     """Round by round the search finds a good plan from a place, or a bad one: where the
@@ -581,6 +615,39 @@ def test_the_way_through_the_air_has_its_price_but_not_for_a_tip_that_pushes(pla
         np.hypot(*(paid.places[1 + beside] - x[:2])), abs=1e-9
     )
     assert cost(20.0, True).cost[0] == cost(0.0, True).cost[0]
+
+
+def test_a_tip_that_pushes_pays_for_the_time_of_a_way_by_what_it_would_push(planner):
+    """The cost of the object's pose, knot by knot, by hand: as long as the way takes it
+    stays where it is, instead of where the present plan leads it."""
+    model, problem, shape = planner
+    x, x_desired = at_a_good_place(planner, [0.55, 0.02, 0.6])
+
+    def one(speed, pause_sec):
+        change = ChangeConfig(0.0, speed, pause_sec, hysteresis=[0.0, 1e9])
+        return sample_round(
+            SamplingConfig(change=change), SamplingMemory(), model.build_many, problem,
+            shape, x, x_desired, 0.1, True, 0.0, dt_sec=model.dt_sec,
+        )[1]  # fmt: skip
+
+    free, paid = one(1e9, 0.0), one(0.2, 0.3)
+    assert free.chosen == paid.chosen == 0 and free.cost[0] == paid.cost[0]
+    cost, goal = PushPlannerConfig(), x_desired[0]
+
+    def of(at):
+        turn = cost.angle_radius * (heading(at[Q_BALL]) - heading(goal[Q_BALL]))
+        return cost.position * (((at - goal)[P_BALL][:2] ** 2).sum() + turn**2)
+
+    gain = of(x) - of(free.x[-1])
+    assert gain > 5.0
+    outline, up = outline_at((0.5, 0.0, 0.3)), shape.clear_height(0.0)
+    away = [
+        0.3 + travel_length(x[P_TIP], [*place, HEIGHT], outline, 0.0235, up) / 0.2
+        for place in paid.places[1:]
+    ]
+    np.testing.assert_allclose(
+        paid.cost[1:] - free.cost[1:], gain * np.array(away) / model.dt_sec, rtol=0.01
+    )  # The cost of a turn is that of its quadratic.
 
 
 def test_a_learned_gap_counts_in_every_plan(planner):

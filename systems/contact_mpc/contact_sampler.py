@@ -181,7 +181,7 @@ class ContactSampler(LeafSystem):
                 x_desired.reshape(-1, N_X), length + c.angle_radius * angle,
                 phase[0] == CONTACT, context.get_time(), r, c.budget_sec,
                 nearer,
-                tuple(goal.tolist()),
+                tuple(goal.tolist()), self._model.dt_sec,
             )  # fmt: skip
         except ValueError:  # An object on edge has no outline.
             return SamplerStatus.NO_PLAN
@@ -204,10 +204,12 @@ def _check(config: ContactSamplerConfig) -> None:
         raise ValueError(
             f"sampling.places is {c.places}, expected an integer from 1 to {PLACES_MAX}"
         )
-    for name in ("clearance", "height", "change.stuck_sec", "reach.bearing"):
+    positive = ("clearance", "height", "change.speed", "change.stuck_sec")
+    for name in (*positive, "reach.bearing"):
         if not 0.0 < (value := attrgetter(name)(c)) < np.inf:
             raise ValueError(f"sampling.{name} is {value}, expected > 0")
-    for name in ("change.travel", "push", "reach.cost", "reach.inwards"):
+    at_least_0 = ("change.travel", "change.pause_sec", "push", "reach.cost")
+    for name in (*at_least_0, "reach.inwards"):
         if not 0.0 <= (value := attrgetter(name)(c)) < np.inf:
             raise ValueError(f"sampling.{name} is {value}, expected >= 0")
     for name in ("change.hysteresis", "reach.range", "reach.wrist"):

@@ -69,6 +69,11 @@ class ChangeConfig:
     """When the tip leaves a place for another one."""
 
     travel: float = 15.0  # Cost of a metre of the tip's path through the air [1/m].
+    # Mean speed of the tip on such a path [m/s], and time that is lost beside it, to
+    # stop and to touch again [s]. While the tip is away the object stays where it is,
+    # which costs as much more as the present plan would have moved it on by then.
+    speed: float = 0.15
+    pause_sec: float = 0.25
     # Amount by which another place has to cost less than the present one, [fraction of
     # the present cost, absolute cost].
     hysteresis: list[float] = field(default_factory=lambda: [0.15, 1.0])
@@ -190,6 +195,7 @@ def sample_round(
     budget_sec: float = np.inf,
     nearer: float = 0.0,
     goal: tuple[float, ...] | None = None,
+    dt_sec: float = 0.1,
 ) -> tuple[SamplingMemory, Round]:
     """One round of ContactSampler.
 
@@ -203,6 +209,7 @@ def sample_round(
         nearer: by how much the object reaches farther out than its shape, as learned;
             the places lie as much farther out [m]; negative: as much farther in.
         goal: tells one goal from the next, whose error is another one.
+        dt_sec: between the knots of a plan [s].
     Raises: ValueError for an object without an outline.
     """
     c, m = config, memory
@@ -219,10 +226,10 @@ def sample_round(
     heading = heading_of(x[Q_BALL])
     guess = np.zeros((len(places), problem.options.N, problem.n_u))
     guess[:, :, :2] = c.push * inward(places, outline)[:, None]
-    if going and m.inputs is not None:
+    if m.inputs is not None:
         # What it was chosen for counts again: whether the search finds as good a plan
-        # in every round is chance, and the tip would turn round each time that it does
-        # not.
+        # in every round is chance, and the tip would turn round, or leave what it has
+        # just touched, each time that it does not.
         guess[0] = turned_inputs(m.inputs, heading)
     cost, u, plans = score_within(budget_sec, lcs, starts, x_desired, problem, guess)
     way = _way_lengths(c, shape, x, places, outline, distance)
@@ -239,17 +246,30 @@ def sample_round(
     m, is_stuck = _with_progress(c, m, error, in_contact, t)
     if is_stuck:
         cost[0] = NO_PLAN
+    elif in_contact and np.isfinite(cost[0]):
+        away = c.change.pause_sec + way[1:] / c.change.speed
+        cost[1:] += _gain(problem, x, x_desired, plans[0]) * away / dt_sec
     keep = m.reached_sec is not None and t - m.reached_sec < c.change.keep_sec
     chosen = 0 if keep and np.isfinite(cost[0]) else choose(cost, c.change.hysteresis)
     m = replace(m, count=m.count + 1)
     known = np.isfinite(cost)
     if known[1:].any():
         m = replace(m, best=to_object(x, places[1 + int(np.argmin(cost[1:]))]))
-    if known[chosen] and (chosen != 0 or going):
+    if known[chosen]:
         m = replace(m, inputs=turned_inputs(u[chosen], heading.T))
     if known[chosen] and chosen != 0:
         m = replace(m, place=to_object(x, places[chosen]), go=m.go + 1)
     return m, Round(places, cost, chosen, plans[chosen])
+
+
+def _gain(problem: C3Problem, x, x_desired, plan) -> float:
+    """How much less a knot costs with the object where a plan (N + 1, n_x) leads it,
+    than with the object where it is; at least 0."""
+    pose = slice(Q_BALL.start, P_BALL.stop)
+    Q, _, goal = problem.state_cost(x, x_desired)
+    off = plan[[0, -1], pose] - goal[0, pose]
+    now, after = np.einsum("ki,ij,kj->k", off, Q[0][pose, pose], off)
+    return max(float(now - after), 0.0)
 
 
 def _places(
