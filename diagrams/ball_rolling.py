@@ -310,6 +310,9 @@ def add_ball_rolling(
     for name, port in _models_of_c3(rig).items():
         rig.feed(port, c3, name)
     rig.feed(learned.r_comp, c3, "r_comp")
+    if rig.builder.HasSubsystemNamed("contact_sampler"):
+        sampler = rig.builder.GetSubsystemByName("contact_sampler")
+        rig.connect(sampler, "guess", c3, "guess")
     rig.connect(c3, "x_next", reference, "x_next")
     rig.connect(c3, "lam", reference, "lam")
     rig.connect(c3, "status", reference, "status")

@@ -4,7 +4,7 @@
        (or --image--> pose_tracker -->)
     state_estimator --x--> push_goals --goal--> push_task, contact_sampler
     push_task --x_desired--> c3_mpc, contact_sampler
-    contact_sampler --command (where to touch)--> push_task
+    contact_sampler --command (where to touch)--> push_task, --guess--> c3_mpc
     pose_sensor, state_estimator --> past_state --> lcs_learn, residual_learner
     residual_learner --r_comp--> c3_mpc, contact_sampler
     or past_state --> parameter_learner --parameters--> lcs_plan, lcs_command,
@@ -587,6 +587,7 @@ def _connect_planning(builder, planning: _Planning, lcs, estimator) -> None:
     connect(sampler, "command", task, "command")
     connect(estimator, "x", planning.c3, "x")
     connect(task, "x_desired", planning.c3, "x_desired")
+    connect(sampler, "guess", planning.c3, "guess")
     connect(lcs["plan"], "lcs", planning.c3, "lcs")
     connect(lcs["command"], "lcs", planning.c3, "lcs_command")
 

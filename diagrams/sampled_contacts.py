@@ -2,7 +2,7 @@
 
     state_estimator --x--> path_target --x_desired--> c3_mpc, contact_sampler
     path_target --goal (the next point on the circle)--> contact_sampler, push_task
-    contact_sampler --command (where to touch)--> push_task
+    contact_sampler --command (where to touch)--> push_task, --guess--> c3_mpc
     c3_mpc (contact), push_task (travel) --> arm_reference
 
 The tip pushes the ball from the side, at constant height. All else is as in

@@ -54,9 +54,11 @@ from makebreak.systems.contact_mpc.numerics.contact_sampling import (
 )
 from makebreak.systems.contact_mpc.numerics.lcs import simulate
 from makebreak.systems.contact_mpc.numerics.object_frame import (
+    heading_of,
     rotation_of,
     to_object,
     to_world,
+    turned_inputs,
 )
 from makebreak.systems.contact_mpc.numerics.outline import (
     distance_to_outline,
@@ -468,6 +470,28 @@ def test_a_tip_that_pushes_keeps_the_plan_that_it_pushes_by(goal):
         )  # fmt: skip
         costs.append(found.cost[0])
     assert found.chosen == 0 and max(costs[1:]) < 1.25 * min(costs)
+
+
+def test_c3_pushes_by_the_plan_that_its_place_was_chosen_for():
+    """From the place it does not find as good a one by itself: it stood there, and the
+    sampler waited for what its own plan promised."""
+    spec, goal = PushedObject("box"), (0.5, -0.06, 0.8)
+    model, problem, shape = own = planner_of(spec)
+    at, x_desired = at_a_good_place(own, goal, spec)
+    memory = SamplingMemory()
+    for _ in range(5):
+        memory, found = sample_round(
+            SamplingConfig(places=1, change=ChangeConfig(hysteresis=[0.0, 1e9])),
+            memory, model.build_many, problem, shape, at, x_desired, 0.1, True, 0.0,
+        )  # fmt: skip
+    inputs = turned_inputs(memory.inputs, heading_of(at[Q_BALL]))
+    lcs, zero = model.build(at, np.zeros(3)), problem.cold_start()
+    costs = [
+        plan_cost(lcs, at, solve_c3(
+            lcs, at, x_desired, problem, zero, guess=guess)[0].u, x_desired, problem)
+        for guess in (None, inputs)
+    ]  # fmt: skip
+    assert costs[1] <= found.cost[0] + 1e-6 < 0.9 * costs[0]
 
 
 @pytest.mark.parametrize("shape", ["disc", "cylinder"])

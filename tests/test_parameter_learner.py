@@ -615,6 +615,31 @@ def test_a_step_that_refutes_the_model_most_counts():
     assert refuting >= 5
 
 
+@pytest.mark.parametrize(("speed", "slip_noise"), [(0.2, 1e-3), (0.0, 0.02)])
+def test_noise_is_as_large_as_what_the_forces_leave_free(speed, slip_noise):
+    """400 steps of a box that is pushed, or pressed, with the noise that their weights
+    say: twice the loss is a chi-square of so many degrees, 5 and 3, not 9."""
+    rng = np.random.default_rng(0)
+    learner, sample = pushed_box(speed, error_share=0.0, slip_noise=slip_noise)
+    weighed, model = learner._Q_d > 0.0, learner.model
+    std = 1.0 / np.sqrt(learner._Q_d[weighed])
+    losses, limits = [], []
+    for _ in range(400):
+        x_next = sample.x_next.copy()
+        x_next[weighed] += std * rng.normal(size=std.size)
+        between = model.between(sample.x_now, x_next)
+        step = Sample(sample.x_now, sample.u, x_next, *between)
+        lcs = model.build(step.x, step.u)
+        loss, _ = learner._loss_of(prior(2), step, lambda z, lcs=lcs: lcs)
+        found = explain(lcs, step, loss)
+        losses.append(2.0 * found.loss)
+        limits.append(learner._noise_of(found))
+    # n + 2 sqrt(2 n) of n degrees is passed by 5 % of a chi-square.
+    assert 0.02 < np.mean(np.array(losses) > limits) < 0.1
+    n = (np.sqrt(2.0 + np.array(limits)) - np.sqrt(2.0)) ** 2
+    assert np.mean(losses) == pytest.approx(n.mean(), rel=0.15)
+
+
 def test_noise_at_rest_tells_nothing():
     """The value went down by 1 % a step, as what a slip's noise costs is less with a
     smaller mass."""

@@ -79,7 +79,9 @@ class C3Mpc(LeafSystem):
              lcs (abstract): the LCS of the horizon, or a sequence of N, one per knot;
              lcs_command (abstract), optional: the LCS of one control step, for x_next;
              default: lcs, or its first one;
-             r_comp (n_lam,) [m/s], optional: the learned residual; default: zero.
+             r_comp (n_lam,) [m/s], optional: the learned residual; default: zero;
+             guess (N n_u,) [N], optional: inputs of a plan, row by row, which the
+             polish starts from if they cost less than C3's and the last plan's.
     Outputs: u (n_u,) [N], always within its bounds;
              x_next (n_x,), lam (n_lam,) [N]: one step of lcs_command under u;
              plan: Plan (abstract);
@@ -130,6 +132,7 @@ class C3Mpc(LeafSystem):
             "lcs_command", AbstractValue.Make(object())
         )
         self._r_comp = self.DeclareVectorInputPort("r_comp", p.n_lam)
+        self._guess = self.DeclareVectorInputPort("guess", N * p.n_u)
         u_lower, u_upper = (b[p.n_lam : p.n_lam + p.n_u] for b in (p.lower, p.upper))
         self._u_idle = np.clip(np.zeros(p.n_u), u_lower, u_upper)
 
@@ -190,7 +193,13 @@ class C3Mpc(LeafSystem):
                     contacts = before, contact, self._per_force
                     warm = warm.shifted(min(self._period / dt, 1.0), contacts)
                 modes = self._modes(context, lcs, x, dt)
-                plan, warm = solve_c3(lcs, x, x_desired, self._problem, warm, modes)
+                guess = None
+                if self._guess.HasValue(context):
+                    guess = np.asarray(self._guess.Eval(context))
+                    guess = guess if is_finite(guess) else None
+                plan, warm = solve_c3(
+                    lcs, x, x_desired, self._problem, warm, modes, guess
+                )
             except C3Failure:
                 status = C3Status.SOLVE_FAILED
         write(self._status, status)

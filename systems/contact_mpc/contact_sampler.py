@@ -11,7 +11,7 @@ import numpy as np
 from pydrake.common.value import Value
 from pydrake.systems.framework import LeafSystem
 
-from makebreak.systems.contact_mpc.numerics.ball_state import N_X
+from makebreak.systems.contact_mpc.numerics.ball_state import N_X, Q_BALL
 from makebreak.systems.contact_mpc.numerics.c3_mpc import C3Problem
 from makebreak.systems.contact_mpc.numerics.contact_sampling import (
     ObjectShape,
@@ -20,6 +20,10 @@ from makebreak.systems.contact_mpc.numerics.contact_sampling import (
     sample_round,
 )
 from makebreak.systems.contact_mpc.numerics.lcs import is_finite
+from makebreak.systems.contact_mpc.numerics.object_frame import (
+    heading_of,
+    turned_inputs,
+)
 from makebreak.systems.contact_mpc.numerics.outline import (
     distance_to_outline,
     outline_of,
@@ -88,6 +92,8 @@ class ContactSampler(LeafSystem):
              parameters, optional: their values for every plan.
     Outputs: command (3,) = [number, x, y]: a place in the object's frame, seen from
              above [m]. A new number is a new command to move there; 0: none yet;
+             guess (N n_u,) [N]: inputs of the plan that the place was chosen for, as
+             C3Mpc reads them;
              status (1,): a SamplerStatus; round (abstract): the last Round, or ().
 
     The command is kept while an input is not finite, the object is not seen or no place
@@ -130,8 +136,10 @@ class ContactSampler(LeafSystem):
         # Not None, which Drake 1.58 cannot hold.
         self._round = self.DeclareAbstractState(Value[object](()))
         self._command = self.DeclareDiscreteState(3)
+        self._guess = self.DeclareDiscreteState(p.options.N * p.n_u)
         self._status = self.DeclareDiscreteState([float(SamplerStatus.NONE_YET)])
         self.DeclareStateOutputPort("command", self._command)
+        self.DeclareStateOutputPort("guess", self._guess)
         self.DeclareStateOutputPort("status", self._status)
         self.DeclareStateOutputPort("round", self._round)
         self.DeclarePeriodicUnrestrictedUpdateEvent(
@@ -188,10 +196,12 @@ class ContactSampler(LeafSystem):
         abstract = state.get_mutable_abstract_state
         abstract(int(self._memory)).set_value(memory)
         abstract(int(self._round)).set_value(found)
+        discrete = state.get_mutable_discrete_state
         if memory.place is not None:
-            state.get_mutable_discrete_state(self._command).set_value(
-                [float(memory.go), *memory.place]
-            )
+            discrete(self._command).set_value([float(memory.go), *memory.place])
+        if memory.inputs is not None:
+            inputs = turned_inputs(memory.inputs, heading_of(x[Q_BALL]))
+            discrete(self._guess).set_value(inputs.ravel())
         if not np.isfinite(found.cost[found.chosen]):
             return SamplerStatus.NO_PLAN
         return SamplerStatus.CHOSEN

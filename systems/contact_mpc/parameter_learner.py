@@ -17,6 +17,7 @@ from makebreak.systems.contact_mpc.multibody.model_parameters import (
 from makebreak.systems.contact_mpc.numerics.parameter_posterior import (
     BEYOND_NOISE,
     Belief,
+    Explained,
     Loss,
     Sample,
     Scale,
@@ -286,10 +287,17 @@ class ParameterLearner(LeafSystem):
         belief = drifted(belief, self._drift)
         after, found = updated(belief, sample, loss, c.trust, build, changes, starts)
         # What no value explains within the noise is something that the model lacks.
-        n = np.count_nonzero(self._Q_d)
-        if found is not None and 2.0 * found.loss > n + BEYOND_NOISE * np.sqrt(2.0 * n):
+        if found is not None and 2.0 * found.loss > self._noise_of(found):
             return belief, found
         return after, found
+
+    def _noise_of(self, found: Explained) -> float:
+        """The most that twice a step's loss may be by noise: of a chi-square of as many
+        degrees as what is weighed has more than the forces that are free."""
+        rows = self._Q_d > 0.0
+        forces = np.linalg.matrix_rank(found.D[np.ix_(rows, found.f > 0.0)])
+        n = np.count_nonzero(rows) - forces
+        return n + BEYOND_NOISE * np.sqrt(2.0 * n)
 
     def _loss_of(self, belief: Belief, sample: Sample, build) -> tuple[Loss, Any]:
         """The step's loss, by what slides and what the forces under the belief do; and

@@ -400,6 +400,7 @@ def solve_c3(
     problem: C3Problem,
     warm: WarmStart | None = None,
     modes=None,
+    guess=None,
 ):
     """One solve of C3, from the state x0.
 
@@ -413,6 +414,7 @@ def solve_c3(
         modes: (n, n_lam) contact modes that the first n knots keep, as contact_modes
             gives them; None: all are free. The forces of contacts that are held closed
             may come out negative.
+        guess: (N, n_u) inputs that the polish starts from, too, if they cost least.
 
     Returns: Plan, and the WarmStart for the next solve.
     Raises: ValueError on wrong shapes; C3Failure where there is no result.
@@ -461,6 +463,7 @@ def solve_c3(
             p.with_sums,
             WarmStart(warm.u, *warm_z),
             modes,
+            guess,
         )
         return without_sums(plan, warm, p.n_x, n_sums)
     scale = 1.0
@@ -524,7 +527,8 @@ def solve_c3(
     u, lam = np.ascontiguousarray(v[:, p.n_lam :]), v[:, : p.n_lam] * scale
     if o.polish > 0:
         ahead = np.vstack([warm.u[1:], warm.u[-1:]])
-        starts = np.concatenate([inputs, warm.u[None], ahead[None]])
+        more = [] if guess is None else [np.reshape(guess, (1, o.N, p.n_u))]
+        starts = np.concatenate([inputs, warm.u[None], ahead[None], *more])
         u_centre = warm.u if o.penalise_input_change else np.zeros_like(u)
         (u_lower, x_lower), (u_upper, x_upper) = (
             np.split(bound[p.n_lam :], [p.n_u]) for bound in (p.lower, p.upper)
