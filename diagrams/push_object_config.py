@@ -331,7 +331,7 @@ def learned_parameters(config: PushObjectConfig) -> list[Parameter]:
         Parameter("mass", own.mass, OBJECT),
         Parameter("com_x", own.com, OBJECT),
         Parameter("com_y", own.com, OBJECT),
-        Parameter("friction", own.friction, pairs=[0]),
+        Parameter("friction", own.friction, pairs=[0], caution=1.0),
         Parameter("friction", own.friction, pairs=table),
         Parameter("gap", own.gap, pairs=[0]),
     ])  # fmt: skip

@@ -154,6 +154,7 @@ def test_values_of_parameters_are_those_of_a_plant_that_has_them():
         (Parameter("mass", 0.5, "door", [0]), r"pairs is \[0\], expected none"),
         (Parameter("mass", 0.0, "door"), "std is 0.0, expected a positive number"),
         (Parameter("mass", 0.5, "door", drift=-1.0), "drift is -1.0, expected 0 or"),
+        (Parameter("mass", 0.5, "door", caution=-1.0), "caution is -1.0, expected 0"),
         (Parameter("mass", 0.5, "door", model=1.0), "model is 1.0, expected none"),
         (
             Parameter("coulomb", 0.5, "door_joint", model=-1.0),
@@ -879,6 +880,24 @@ def test_no_plan_is_made_for_a_friction_that_drives():
     context.SetAbstractState(0, replace(first, belief=sure))
     assert learner.GetOutputPort("estimate").Eval(context) == pytest.approx([-2.0])
     assert learner.GetOutputPort("parameters").Eval(context) == [0.0]
+
+
+def test_what_a_plan_relies_on_is_planned_with_at_its_lower_end():
+    """Deviations of the logarithm, which get smaller as the learner gets sure."""
+    item = Parameter("friction", 0.5, pairs=[0], caution=1.0)
+    diagram, _ = diagram_of(DOOR.world(DOOR.values))
+    config = ParameterLearnerConfig(DOOR.pairs(DOOR.values), [item])
+    learner = ParameterLearner(diagram, config, DOOR.dt)
+    context = learner.CreateDefaultContext()
+    memory, mu = learner._memory_of(context), DOOR.values["friction"]
+    for mean, information, planned in (
+        (0.0, 1.0, mu * np.exp(-0.5)), (0.0, 100.0, mu * np.exp(-0.05)),
+        (-2.0, 1e8, mu * np.exp(-1.0)),
+    ):  # fmt: skip
+        belief = Belief(np.array([mean]), np.array([[information]]))
+        context.SetAbstractState(0, replace(memory, belief=belief))
+        got = learner.GetOutputPort("parameters").Eval(context)
+        assert got == pytest.approx([planned], rel=1e-3)
 
 
 @pytest.mark.parametrize("chooses", [False, True])

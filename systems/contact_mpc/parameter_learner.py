@@ -107,11 +107,11 @@ class ParameterLearner(LeafSystem):
              period that ends now; enable (1,), optional: 0 drops the steps that this
              sample belongs to.
     Outputs: parameters (n,): values to plan with, each as far from the model's as it is
-             certain; estimate (n,): the most probable values; std (n,): of z, so of the
-             logarithm times the parameter's std for masses, damping and friction, else
-             in units of it; unknown (1,): deviation of the logarithm of all masses,
-             damping and friction together, for CarefulGoal; loss (1,): of the newest
-             step; status (1,): a ParameterStatus.
+             certain, less its caution; estimate (n,): the most probable values; std
+             (n,): of z, so of the logarithm times the parameter's std for masses,
+             damping and friction, else in units of it; unknown (1,): deviation of the
+             logarithm of all masses, damping and friction together, for CarefulGoal;
+             loss (1,): of the newest step; status (1,): a ParameterStatus.
 
     The learner builds its own LCS about each measured state, with dt = period_sec, so
     its rate does not depend on the planner's.
@@ -187,8 +187,11 @@ class ParameterLearner(LeafSystem):
         # No plan for a friction that drives.
         lowest = [0.0 if p.kind in POSITIVE else -np.inf for p in c.parameters]
 
+        caution = np.array([p.caution for p in c.parameters])
+
         def to_plan_with(memory):
-            return np.maximum(values(certain_part(memory.belief)), lowest)
+            z = certain_part(memory.belief) - caution * memory.belief.std
+            return np.maximum(values(z), lowest)
 
         output("parameters", n, to_plan_with)
         output("estimate", n, lambda m: values(m.belief.mean))

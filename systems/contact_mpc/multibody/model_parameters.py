@@ -49,7 +49,9 @@ class Parameter:
     pairs: for friction, rolling and gap, the numbers of the contact pairs that have the
     value. drift: how much of it may be new after one second, in deviations std per
     sqrt(s). model: the model's value of a kind that Drake's plants do not have
-    (coulomb, rolling, force).
+    (coulomb, rolling, force). caution: deviations by which the value to plan with is
+    below the learned one, for what a plan relies on: a push slips off a side that is
+    smoother than believed, and holds on one that is rougher.
     """
 
     kind: str
@@ -58,6 +60,7 @@ class Parameter:
     pairs: list[int] = field(default_factory=list)
     drift: float = 0.0
     model: float = 0.0
+    caution: float = 0.0
 
 
 class ModelParameters:
@@ -225,8 +228,9 @@ def _check(p: Parameter, name: str, n_pairs: int) -> None:
         raise ValueError(f"{name}: unknown kind, expected one of {', '.join(KINDS)}")
     if not (np.isfinite(p.std) and p.std > 0.0):
         raise ValueError(f"{name}: std is {p.std}, expected a positive number")
-    if not (np.isfinite(p.drift) and p.drift >= 0.0):
-        raise ValueError(f"{name}: drift is {p.drift}, expected 0 or more")
+    for of, value in (("drift", p.drift), ("caution", p.caution)):
+        if not (np.isfinite(value) and value >= 0.0):
+            raise ValueError(f"{name}: {of} is {value}, expected 0 or more")
     least = 0.0 if p.kind in POSITIVE else -np.inf
     if not (np.isfinite(p.model) and p.model >= least):
         raise ValueError(f"{name}: model is {p.model}, expected 0 or more")
