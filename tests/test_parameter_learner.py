@@ -42,6 +42,7 @@ from makebreak.systems.contact_mpc.numerics.parameter_posterior import (
     Scale,
     acting,
     certain_part,
+    changes_by,
     drifted,
     error_weights,
     explain,
@@ -816,6 +817,27 @@ def test_what_sticks_tells_of_friction_only_beyond_the_noise():
             expected = 1.0 if counts or not one_sided else 0.0
             np.testing.assert_allclose(information, expected)
             np.testing.assert_allclose(gradient, -off * expected)
+
+
+def test_what_sticks_tells_of_no_friction_where_the_explanation_lifts_the_object():
+    """A finger at a corner, whose contact has another normal than modelled, was taken
+    for one that is rougher."""
+    learner, sample = pushed_box(0.0, excess=1.5)
+    lcs = learner.model.build(sample.x, sample.u)
+    loss, slides = learner._loss_of(prior(2), sample, lambda z: lcs)
+    found = explain(lcs, sample, loss)
+    values, rough = learner._scale.values(np.zeros(2)), np.array([0.4, 1.1 * BOX_MU])
+    dx, dw = learner.model.step_changes(sample.x, sample.u, lcs, found.lam, values)
+    dx[:, 1], dw[:, 1] = changes_by(
+        lcs, learner.model.build(sample.x, sample.u, parameters=rough), sample,
+        found.lam,
+    )  # fmt: skip
+    one_sided = learner.model.sticks(lcs, slides)
+    assert one_sided.tolist() == [False, True]
+    lifted = replace(found, eta=found.eta + 0.1 * (found.f > 0.0))
+    for each, counts in ((found, True), (lifted, False)):
+        _, information = gradient_and_information(each, sample, loss, dx, dw, one_sided)
+        assert (information[1, 1] > 0.0) == counts
 
 
 def test_what_is_not_felt_tells_only_that_the_gap_is_larger():

@@ -339,8 +339,13 @@ def gradient_and_information(
     of_lam = np.vstack([root @ found.D[:, free], stiff * found.F[np.ix_(closed, free)]])
     of_z = _unexplained(of_z, of_lam)
     missed = np.append(root @ error, stiff * loss.gamma * found.force[closed])
+    # Nor is it believed where the explanation parts what touches, as measured.
+    apart = (
+        BEYOND_NOISE * np.sqrt(loss.eps * loss.gamma) * found.acting.rows.sum(axis=0)
+    )
     noise = one_sided & (
-        (of_z.T @ missed) ** 2 <= BEYOND_NOISE**2 * (of_z**2).sum(axis=0)
+        ((of_z.T @ missed) ** 2 <= BEYOND_NOISE**2 * (of_z**2).sum(axis=0))
+        | (found.eta > apart)[found.f > 0.0].any()
     )
     # Then its friction may be any, and what another parameter changes as a friction
     # does tells as little: a mass would get what the friction is not allowed to.
