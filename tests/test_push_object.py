@@ -541,7 +541,7 @@ def test_what_the_learner_of_parameters_knows_is_planned_with():
     assert [p.kind for p in learner.model.parameters.items] == [
         "mass", "friction", "friction", "gap",
     ]  # fmt: skip
-    sure = Belief(np.array([1.0, -1.0, 0.5, 2.0]), 1e8 * np.eye(4))
+    sure = Belief(np.array([1.0, -1.0, 0.5, 2.0]), 1e14 * np.eye(4))
     its.SetAbstractState(0, replace(learner._memory_of(its), belief=sure))
     expected = [0.4 * np.exp(0.5), 0.5 * np.exp(-0.5), 0.5 * np.exp(0.25)]
     for name in ("lcs_plan", "lcs_command", "contact_sampler"):
