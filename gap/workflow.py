@@ -218,15 +218,13 @@ def _run(
     checks += check_recordings(parts.decided, scene_facts(dynamics.plant))
     checks += check_tool_weight(dynamics, parts.decided)
     is_mechanism = _is_mechanism(dynamics, recordings)
-    pushes = is_mechanism and push_each_other(dynamics, parts.decided)
+    pushes = is_mechanism and any(
+        asked(dynamics, parts.decided) for asked in (push_each_other, presses)
+    )
     checks += check_contents(dynamics.plant, parts.decided, pushes)
     checks += check_untold(scene, parts.decided)
     # An impact would be smeared by means over rows.
-    meets = (
-        pushes
-        or is_mechanism
-        and any(asked(dynamics, parts.decided) for asked in (runs_against, presses))
-    )
+    meets = pushes or is_mechanism and runs_against(dynamics, parts.decided)
     seconds["checks"] = clock.lap()
     limbs = limbs_of(dynamics, parts.decided) if is_mechanism and not meets else []
     if limbs:

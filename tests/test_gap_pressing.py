@@ -9,6 +9,7 @@ import pytest
 from push_problems import screen_of
 from pydrake.systems.framework import DiagramBuilder
 
+from makebreak.gap import workflow
 from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.data.table import write_recording
 from makebreak.gap.fit import fit_effects
@@ -24,6 +25,7 @@ from makebreak.gap.simulation.contact_windows import LAW, PushWindows
 from makebreak.gap.workflow import (
     conclude,
     judged_channels,
+    nothing_compared,
     problem_for,
     unjudged_channels,
 )
@@ -350,6 +352,16 @@ def test_a_wall_in_which_the_tool_is_deep_was_passed_on_the_side_that_it_presses
     off = {problem.shapes.names[k]: by for k, by in problem.off.items()}
     assert off[WALL] == {"x": pytest.approx(wall - 0.3, abs=1e-3)}
     assert off.get(TABLE, {"z": 0.0})["z"] == pytest.approx(table, abs=1e-3)
+
+
+def test_efforts_that_press_are_not_taken_for_a_columns_error(tmp_path, monkeypatch):
+    """What presses down takes from what holds the weight: as if of the other sign."""
+    write_scene(tmp_path)
+    record(tmp_path, mu=(0.42, 0.35))
+    monkeypatch.setattr(workflow, "_compared", lambda *args: nothing_compared(args[4]))
+    result = workflow.run_gap(tmp_path / "scene.yaml", [tmp_path / "recording.csv"])
+    (sign,) = [c for c in result.checks if c.kind == "effort_sign"]
+    assert sign.severity == "warning"
 
 
 def test_places_and_frictions_are_named(displaced):

@@ -1128,8 +1128,9 @@ def check_contents(
     plant: MultibodyPlant, recordings: Sequence[Recording], pushes: bool = False
 ) -> list[Finding]:
     """What channels' contents say against their names: until that is put right, an
-    effect would only make up for it. pushes: whether links push each other, so that
-    efforts are other than the motion alone needs: of them nothing is sure then."""
+    effect would only make up for it. pushes: whether links push each other, or what
+    is fixed, so that efforts are other than the motion alone needs: of them nothing is
+    sure then."""
     joints = [
         JointName(
             full_name(plant, j),
