@@ -47,7 +47,7 @@ KNOWN = {
     },
     "gap/residuals/contact_candidates.py": {
         "body_drag", "constant_force", "contact_friction", "friction_patch",
-        "object_com", "object_inertia", "object_mass", "object_size", "plane_height",
+        "object_com", "object_inertia", "object_size", "plane_height",
         "plane_tilt",
     },
     "gap/residuals/contact_problem.py": {  # Of which the candidates were a part.
