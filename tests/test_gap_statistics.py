@@ -1188,16 +1188,18 @@ def test_evidence_of_what_a_simulation_leaves_counts_what_its_nuisances_cost():
 
 
 @pytest.mark.parametrize(
-    ("score", "jumps", "named"),
-    [(0.96, True, False), (0.94, True, True), (0.96, False, True)],
+    ("score", "alone", "named"),
+    [(0.96, False, False), (0.94, False, True), (0.96, True, True)],
 )
-def test_what_evidence_takes_must_show_by_the_last_weights(score, jumps, named):
-    """Where errors jump: steps of another length are evidence for a damping there,
-    which takes nothing off."""
+def test_what_evidence_takes_must_show_by_the_last_weights(score, alone, named):
+    """Where evidence alone is not enough: where errors jump, steps of another length
+    are evidence for a damping, which takes nothing off."""
     effect = Effect("joint_viscous_damping", ["a.j"], {"damping": 0.1})
     choice = Choice(effect, {"damping": 0.01}, 1.0, score, "", 1.0, (), (), 1)
     search = object.__new__(Comparison)
-    search.plan = SearchPlan(counts_evidence=True, least_gain=0.05, jumps=jumps)
+    search.plan = SearchPlan(
+        counts_evidence=True, least_gain=0.05, evidence_alone=alone
+    )
     search.start = SimpleNamespace(score=1.0)  # type: ignore[assignment]
     search.problem = SimpleNamespace(least=lambda kind, at: {})  # type: ignore[assignment]
     current = SimpleNamespace(score=score)
