@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from scipy.optimize import differential_evolution, least_squares
+from scipy.optimize import least_squares
 
 from makebreak.gap.budget import go_on
 from makebreak.gap.numerics.agreed_step import agreed_step
@@ -21,8 +21,6 @@ SHORT = 8  # Evaluations: a fit of no more is not asked to converge.
 # Of what a step changed, what slopes may have missed: to be kept, and to be as good as
 # exact; and of all that is left, what is nothing.
 BENT, STRAIGHT, NOTHING = 0.1, 1e-2, 1e-6
-AROUND = 0.5  # Of a parameter's size: how far a search without slopes looks.
-MOST_FAR = 450  # Simulations, about.
 # Of a search by blocks of time: steps, shares of each that are tried, and the least of
 # what is left that a step must take off.
 MOST_BY_BLOCKS, SHARES_OF_STEP, BETTER = 8, (1.0, 0.5, 0.25), 0.02
@@ -352,35 +350,6 @@ def search_by_blocks(
         if better < BETTER:
             break
     return tuple(_tidy(e) for e in free.effects(z))
-
-
-def search_far(
-    problem: GapProblem, screen: Screen, start: Sequence[Effect],
-    fixed: Sequence[Sequence[str]],
-) -> tuple[Effect, ...] | None:  # fmt: skip
-    """The same out of a valley, by differential evolution: when which foot lands first
-    changes, the error jumps, and slopes tell little. None: of so many parameters no
-    such search tells anything."""
-    free = _Free(problem, start, [tuple(names) for names in fixed])
-    if len(free.names) > MOST_FREE:
-        return None
-
-    def cost(z) -> float:
-        go_on()
-        if np.any(z * free.scale < free.low):
-            return 1e6
-        try:
-            error = screen.evaluate(problem.residual(free.effects(z))).train
-        except (ValueError, RuntimeError):  # Such parameters are refused.
-            return 1e6
-        return float(error) if np.isfinite(error) else 1e6
-
-    z0 = free.x0 / free.scale
-    found = differential_evolution(
-        cost, [(z - AROUND, z + AROUND) for z in z0], x0=z0, init="sobol",
-        maxiter=min(15, MOST_FAR // (6 * len(z0))), popsize=6, polish=False, rng=0,
-    )  # fmt: skip
-    return tuple(_tidy(e) for e in free.effects(found.x))
 
 
 class _Free:

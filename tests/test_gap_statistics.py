@@ -11,7 +11,7 @@ from scipy.optimize import lsq_linear
 from scipy.signal import lfilter
 
 from makebreak.gap import fit, workflow
-from makebreak.gap.fit import fit_effects, search_far
+from makebreak.gap.fit import fit_effects
 from makebreak.gap.numerics.selection import (
     LinearFit,
     Screen,
@@ -412,52 +412,6 @@ def test_a_load_that_links_could_imitate_is_the_same_in_each_part():
     fitted.effects = (Effect("joint_viscous_damping", ["arm.j1"], {"damping": value}),)
     fitted.rows = rows(value)
     assert consistency(problem, fitted)[0] < 2.0
-
-
-class Steps:
-    """r = |x - 0.3| in steps of 0.02, and what slopes say of it: nothing."""
-
-    plan = SearchPlan(jumps=True)
-    dynamics = SimpleNamespace(now=lambda kind, at: {})
-    by_equations = False
-
-    def least(self, kind, at):
-        return {}
-
-    def apart(self, effects, names):
-        return []
-
-    def moved_by(self, effect):
-        return np.ones(8, bool)
-
-    def replaced(self, effects):
-        return None
-
-    def prior_rows(self, effects):
-        return np.zeros(0)
-
-    def residual(self, effects=()):
-        x = effects[0].parameters["damping"] if effects else 0.0
-        return np.full(8, 10.0 * np.round(abs(x - 0.3) / 0.02) * 0.02)
-
-    def base(self):
-        return self.residual()
-
-    def train(self):
-        return np.arange(8) < 6
-
-    def blocks(self):
-        return np.arange(8)
-
-
-def test_a_search_without_slopes_crosses_the_steps_that_stop_a_fit():
-    model = Steps()
-    screen = Screen(model.base(), np.zeros((8, 0)), np.zeros(0), model.train())
-    start = [Effect("joint_viscous_damping", ["p.j1"], {"damping": 0.205})]
-    stuck = fit_effects(model, screen, start)  # What does not show stays neutral.
-    assert stuck.effects[0].parameters["damping"] == 0.0
-    (found,) = search_far(model, screen, start, [()])
-    assert found.parameters["damping"] == pytest.approx(0.3, abs=0.011)
 
 
 def test_bounded_nuisances_are_those_of_bounded_least_squares():

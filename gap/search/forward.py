@@ -7,7 +7,7 @@ from functools import partial
 from itertools import pairwise
 
 from makebreak.gap.budget import Stopped
-from makebreak.gap.fit import fit_effects, search_by_blocks, search_far
+from makebreak.gap.fit import fit_effects, search_by_blocks
 from makebreak.gap.problem import Fitted
 from makebreak.gap.result import Considered
 from makebreak.gap.search.add import add_next
@@ -129,25 +129,22 @@ def _converged(search: Comparison, chosen: Sequence[Choice], current: Fitted) ->
     """A fit of a short list is stopped early; here it is carried on, because what it
     has not reached yet would be looked for in other effects."""
     fixed, jumps = fixed_parameters(chosen), search.plan.jumps
-    steps = 2 * search.plan.evaluations
-    for look in (search_by_blocks, search_far) if jumps else (None,):
-        by_evidence = search.plan.counts_evidence and look is search_by_blocks
-        if not search.needs_more(current) and not by_evidence:
-            break
-        screen = search.screen(current.r, current.fit.train)
-        effects: tuple[Effect, ...] | None = current.effects
-        try:
-            if look is not None:
-                effects = look(search.problem, screen, current.effects, fixed)
-            if effects is None:
-                break
-            more = fit_effects(search.problem, screen, effects, fixed, steps)
-        except Stopped:
-            search.budget.leave("the last fit to its end")
-            break
-        if more.fit.train < current.fit.train:
-            current = more
-    return current
+    by_evidence = jumps and search.plan.counts_evidence
+    if not (search.needs_more(current) or by_evidence):
+        return current
+    screen = search.screen(current.r, current.fit.train)
+    effects: tuple[Effect, ...] | None = current.effects
+    try:
+        if jumps:
+            effects = search_by_blocks(search.problem, screen, current.effects, fixed)
+        if effects is None:
+            return current
+        steps = 2 * search.plan.evaluations
+        more = fit_effects(search.problem, screen, effects, fixed, steps)
+    except Stopped:
+        search.budget.leave("the last fit to its end")
+        return current
+    return more if more.fit.train < current.fit.train else current
 
 
 # ----- Back to a tie
