@@ -396,9 +396,9 @@ class WindowModel(WindowedResidual):
             and (law := law_of(self.scene.actuation, j)) is not None
         }  # fmt: skip
         joints = _velocity_starts(plant)
-        if not laws or set(joints) != set(self.joints):
+        n = plant.num_positions()  # Of a mechanism whose motion is known, not a base.
+        if not laws or n != len(joints) or set(joints) != set(self.joints):
             return
-        n = len(joints)
         kp, kd, q = np.zeros(n), np.zeros(n), np.zeros(n)
         time = recording.time[episode.rows]
         held = np.zeros((len(time), n))

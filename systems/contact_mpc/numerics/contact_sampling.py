@@ -69,10 +69,10 @@ class ChangeConfig:
     """When the tip leaves a place for another one."""
 
     travel: float = 15.0  # Cost of a metre of the tip's path through the air [1/m].
-    # Mean speed of the tip on such a path [m/s], and time that is lost beside it, to
-    # stop and to touch again [s]. While the tip is away the object stays where it is,
-    # which costs as much more as the present plan would have moved it on by then.
+    # Mean speed of the tip on such a path [m/s]. While the tip is away the object stays
+    # where it is, which costs as much more as the present plan would have moved it.
     speed: float = 0.15
+    # Time that is lost beside the path, to stop and to touch again [s].
     pause_sec: float = 0.25
     # Amount by which another place has to cost less than the present one, [fraction of
     # the present cost, absolute cost].
