@@ -343,7 +343,7 @@ class InverseModel(WhitenedRows):
         not known of velocities: at which instant of a row's period they were computed,
         those with a filter of their own each by itself, all others together.
         (Differences of positions are half a row late, a simulator's velocities half a
-        step.) Any instant within half a period is as likely as another."""
+        step.) Three tolerances are half a period."""
         columns, names = [], []
         filtered_too: list[int] = []
         others: list[int] = []
@@ -373,7 +373,7 @@ class InverseModel(WhitenedRows):
             own = f"sensor_delay of {self.joints[some[0]]}.velocity, delay"
             names.append(VELOCITIES_LATE if some == others else own)
         row = min(r.period_sec() for r in self.recordings)
-        return columns, [row / np.sqrt(12.0)] * len(columns), names
+        return columns, [row / 6.0] * len(columns), names
 
     def loop_timing(self) -> tuple[list[np.ndarray], list[float], list[str]]:
         """Columns (m,) of the residual, standard deviations [s] and names of what is
