@@ -37,13 +37,14 @@ def test_what_stairs_do_beside_their_line_is_that_of_two_simulations(seed):
 
 
 def test_a_long_rest_before_stairs_is_no_step():
-    time = np.append(0.0, 2.0 + 0.01 * np.arange(40))
-    held = np.append(0.0, 1e-3 * np.arange(1, 41))[:, None]
-    dq, dv = beside_line(np.eye(1) / 1e-3, *np.full((2, 1), 1.0), time, held, 2.1)
-    assert np.abs(dq).max() < 1e-3 and np.abs(dv).max() < 0.1
-    none = beside_line(np.eye(1), np.ones(1), np.ones(1), time, held, 1.0)
+    time = np.append(0.01 * np.arange(30), 2.0 + 0.01 * np.arange(12))
+    held = np.append(1e-9 * np.arange(30), 5e-3 * np.arange(1, 13))[:, None]
+    servo = np.eye(1) / 1.7e-3, np.array([12.0]), np.array([0.3])
+    for at in (1.999, 2.05):  # 5 mrad if the line began amid the rest.
+        assert np.abs(beside_line(*servo, time, held, at)[0]).max() < 1e-4
+    none = beside_line(*servo, time, held, 0.1)
     assert not np.any(none)  # Too little is known of what was before.
-    assert not np.any(beside_line(np.eye(1), *np.ones((2, 1)), time[:0], held[:0], 1.0))
+    assert not np.any(beside_line(*servo, time[:0], held[:0], 1.0))
 
 
 @pytest.mark.parametrize("start", [0.0, 7.3])
