@@ -16,7 +16,7 @@ def beside_line(
     mobility: np.ndarray,
     kp: np.ndarray,
     kd: np.ndarray,
-    time: np.ndarray,
+    since: np.ndarray,
     held: np.ndarray,
     at: float,
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -28,18 +28,15 @@ def beside_line(
     The line goes through the middle of each step, of longer ones half a usual step
     from their ends.
 
-    Args: mobility: (n, n) M^-1. kp, kd: (n,) gains of drives, zero of others. time:
-        (m,) instants [s] from which commands held (m, n) hold.
+    Args: mobility: (n, n) M^-1. kp, kd: (n,) gains of drives, zero of others. since:
+        (m,) instants [s] of steps, from which commands held (m, n) hold.
     """
     n, none = len(kp), (np.zeros(len(kp)), np.zeros(len(kp)))
-    moves = np.ones(len(time), bool)
-    moves[1:] = np.any(held[1:] != held[:-1], axis=1)
-    since = time[moves]
     first, last = np.searchsorted(since, at, "right") - 1 - STEPS, len(since)
     if first < 0 or last - first < STEPS + 3:
         return none
     some = slice(first, first + STEPS + 3)
-    since, held = since[some], held[moves][some]
+    since, held = since[some], held[some]
     usual = float(np.median(np.diff(since)))
     # Of a longer step two points, half a usual step from its ends.
     ends = np.maximum(since[1:] - 0.5 * usual, 0.5 * (since[1:] + since[:-1]))

@@ -207,10 +207,8 @@ class SceneSimulation:
         out = np.empty((len(times), len(channels)))
         motions: dict = {}
         for i, channel in enumerate(channels):
-            known, value = (
-                needed,
-                self._channels.true_values(channel, x, effort, motions),
-            )
+            known = needed
+            value = self._channels.true_values(channel, x, effort, motions)
             if channel in stages:
                 place = f"{channel.rpartition('.')[0]}.position"
                 if channel.endswith(".velocity") and place in self._channels:

@@ -342,6 +342,7 @@ class WindowModel(WindowedResidual):
                 rough[max(k - BESIDE, 0) : k + BESIDE + 1] = True
         commands = [recording.held(c.name)[episode.rows] for c in recording.commands()]
         jumps = self._unknown_jumps(recording, episode)
+        add_stairs = self._stairs(recording, episode)
         # At an end a smoothed state is less sure than it knows, and what was commanded
         # before is not known.
         margin = min(MARGIN_SEC, 0.1 * (time[-1] - time[0]))
@@ -363,7 +364,7 @@ class WindowModel(WindowedResidual):
                 after = time[rows] - t0
                 std = np.empty((len(after), len(self.channels)))
                 state = {n: x[start_row] for n, x in states.items()}
-                self._beside_line(recording, episode, t0, state)
+                add_stairs(t0, state)
                 grown = self._grown(recording, states, spreads, rows, after, jumps)
                 # No less than along a straight line: behind filters a smoothed state is
                 # less sure than it knows, also where the motion makes little of it.
@@ -386,9 +387,9 @@ class WindowModel(WindowedResidual):
                 )  # fmt: skip
             start_row = max(int(np.searchsorted(time, t0 + hop)), start_row + 1)
 
-    def _beside_line(self, recording, episode, t0: float, state) -> None:
-        """Adds to a window's start {signal: (value, rate, accel.)} what a smoothed
-        motion does not show of drives that get commands in stairs."""
+    def _stairs(self, recording: Recording, episode: Episode):
+        """Adds to a window's start {signal: (value, rate, accel.)}, at a time [s], what
+        a smoothed motion does not show of drives that get commands in stairs."""
         plant = self.dynamics.plant
         laws = {
             j: law for j in self.joints
@@ -398,22 +399,30 @@ class WindowModel(WindowedResidual):
         joints = _velocity_starts(plant)
         n = plant.num_positions()  # Of a mechanism whose motion is known, not a base.
         if not laws or n != len(joints) or set(joints) != set(self.joints):
-            return
-        kp, kd, q = np.zeros(n), np.zeros(n), np.zeros(n)
+            return lambda t0, state: None
+        kp, kd = np.zeros(n), np.zeros(n)
         time = recording.time[episode.rows]
         held = np.zeros((len(time), n))
-        for name, i in joints.items():
-            q[i] = state[f"{name}.position"][0]
         for name, law in laws.items():
             i = joints[name]
             kp[i], kd[i] = float(law.kp), float(law.kd)
             held[:, i] = recording.held(f"{name}.position_command")[episode.rows]
-        mass = self.dynamics.momentum(np.tile(q, (n, 1)), np.eye(n))
-        told = np.isfinite(held).all(axis=1)
-        dq, dv = beside_line(np.linalg.inv(mass), kp, kd, time[told], held[told], t0)
-        for name, i in joints.items():
-            key = f"{name}.position"
-            state[key] = state[key] + np.array([dq[i], dv[i], 0.0])
+        moves = np.ones(len(time), bool)
+        moves[1:] = np.any(held[1:] != held[:-1], axis=1)
+        steps = moves & np.isfinite(held).all(axis=1)
+        since, held = time[steps], held[steps]
+
+        def add(t0: float, state: dict[str, np.ndarray]) -> None:
+            q = np.zeros(n)
+            for name, i in joints.items():
+                q[i] = state[f"{name}.position"][0]
+            mass = self.dynamics.momentum(np.tile(q, (n, 1)), np.eye(n))
+            dq, dv = beside_line(np.linalg.inv(mass), kp, kd, since, held, t0)
+            for name, i in joints.items():
+                key = f"{name}.position"
+                state[key] = state[key] + np.array([dq[i], dv[i], 0.0])
+
+        return add
 
     def _best_start(self, time, states, row: int) -> int:
         """The row at or soon after one at which a window begins."""
