@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from makebreak.gap.problem import Outcome
-from makebreak.gap.residuals.where import begins, jump_time
+from makebreak.gap.residuals.where import begins, jump_time, share_explained
 from makebreak.gap.result import GapMeasure, Unexplained, Where
 from makebreak.gap.workflow import _since
 
@@ -21,6 +21,26 @@ def test_a_jump_of_the_mean_is_found_where_it_is(at):
     t = np.arange(0.0, 10.0, 0.05)
     y = np.where(t < at, -1.0, 2.0) + rng.normal(size=len(t))
     assert jump_time(t, y) == pytest.approx(at, abs=0.15)
+
+
+@pytest.mark.parametrize("noise", [0.0, 1.0, 3.0])
+def test_the_share_that_a_feature_explains_is_that_of_its_variance(noise):
+    """Of a wave of variance 1/2, whatever bins cut it; of noise alone none."""
+    rng = np.random.default_rng(0)
+    x = rng.uniform(0.0, 2.0 * np.pi, 20000)
+    y = np.sin(x) + noise * rng.normal(size=len(x))
+    within = np.sinc(1.0 / 12.0) ** 2  # Of the wave: what means over a bin keep.
+    expected = 0.5 * within / (0.5 + noise**2)
+    assert share_explained(x, y) == pytest.approx(expected, abs=0.01)
+    assert share_explained(x, rng.permutation(y)) == pytest.approx(0.0, abs=0.01)
+
+
+def test_no_more_samples_than_bins_explain_nothing():
+    x = np.arange(12.0)
+    assert share_explained(x, x) == share_explained(x[:1], x[:1]) == 0.0
+    assert share_explained(np.arange(13.0), np.arange(13.0)) > 0.5
+    assert share_explained(np.zeros(50), np.arange(50.0)) == 0.0
+    assert share_explained(np.arange(50.0), np.zeros(50)) == 0.0
 
 
 def test_neither_noise_nor_a_vibration_is_a_jump():

@@ -4,14 +4,18 @@ a faster loop. Beside fine integration."""
 import numpy as np
 import pytest
 from scipy.linalg import inv
+from test_gap_sticking import encoders, four_joints, goals, log_of
 
 from makebreak.gap.data.command_clock import moved_sooner
 from makebreak.gap.data.conditioning import condition
-from makebreak.gap.data.reading import read_recording
+from makebreak.gap.data.reading import read_recording, read_recordings
 from makebreak.gap.data.table import write_recording
 from makebreak.gap.numerics.signal_relation import relate
 from makebreak.gap.numerics.stairs import beside_line
+from makebreak.gap.simulation import windows
+from makebreak.gap.simulation.driven_arm import DrivenArmSimulation
 from makebreak.gap.simulation.sensor_samples import behind, with_middles
+from makebreak.gap.simulation.windows import WindowModel
 from makebreak.systems.numerics.filters import MovingAverage
 
 
@@ -132,3 +136,30 @@ def test_a_mean_of_simulated_velocities_is_what_positions_moved():
     assert np.abs(got - mean).max() < 5e-4
     plain = np.interp(at, t, behind(stages, t, velocity, None))
     assert np.abs(plain - mean).max() > 4e-3
+
+
+def test_windows_begin_with_what_stairs_of_commands_do(tmp_path, monkeypatch):
+    scene, joints = four_joints(tmp_path)
+    time, told = goals(len(joints), np.random.default_rng(0))
+    file, _ = log_of(scene, joints, tmp_path, time, told, encoders(0, 2e-4))
+    (recording,) = read_recordings([file])
+    asked, n = [], len(joints)
+
+    def starts(by):
+        def known(*args):
+            asked.append(args)
+            return np.full(n, by), np.full(n, 2.0 * by)
+
+        monkeypatch.setattr(windows, "beside_line", known)
+        model = WindowModel(scene, [recording], simulation=DrivenArmSimulation(scene))
+        return [w.state[f"{j}.position"] for w in model.windows for j in joints]
+
+    for plain, moved in zip(starts(0.0), starts(0.1), strict=True):
+        np.testing.assert_allclose(moved - plain, [0.1, 0.2, 0.0], atol=1e-12)
+    mobility, kp, kd, since, held, at = asked[-1]
+    assert (np.linalg.eigvalsh(mobility) > 0.0).all() and at > since[0]
+    by_name = dict(zip(joints, zip(scene.actuation.kp, scene.actuation.kd, strict=True),
+                       strict=True))  # fmt: skip
+    assert sorted(zip(kp, kd, strict=True)) == sorted(by_name.values())
+    assert (held[1:] != held[:-1]).any(axis=1).all() and len(since) == len(held)
+    np.testing.assert_allclose(np.sort(held[0]), np.sort(told[:, 0]), atol=1e-8)

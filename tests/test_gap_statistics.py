@@ -1141,6 +1141,23 @@ def test_evidence_of_what_a_simulation_leaves_counts_what_its_nuisances_cost():
     assert search.evidence(one, other, 0) == pytest.approx(evidence)  # type: ignore[arg-type]
 
 
+def test_evidence_of_columns_counts_what_nuisances_cost_beside_them():
+    """What a column does, a nuisance five tolerances from its value does as well."""
+    rng = np.random.default_rng(4)
+    N, own, other = rng.normal(size=(3, 400, 1))
+    prior, r = np.array([0.1]), 0.5 * N[:, 0] + 1e-3 * rng.normal(size=400)
+    search = object.__new__(Comparison)
+    search.train = np.arange(400) % 30 < 20
+    search.nuisances = SimpleNamespace(prior=prior)  # type: ignore[assignment]
+    search.problem = SimpleNamespace(correlation=1.0)  # type: ignore[assignment]
+    search.start = SimpleNamespace(score=1.0)  # type: ignore[assignment]
+    screen = Screen(1e3 * r, 1e3 * N, prior, search.train)
+    cheap, costly = 1e3 * (N + 1e-9 * own), 1e3 * other
+    for one, two, cost in ((cheap, costly, 25.0), (costly, cheap, -25.0)):
+        evidence = search.evidence_by_columns(screen, one, two)
+        assert evidence == pytest.approx(cost, abs=6.0)
+
+
 @pytest.mark.parametrize(
     ("score", "alone", "named"),
     [(0.96, False, False), (0.94, False, True), (0.96, True, True)],
