@@ -310,13 +310,17 @@ def _check_includes(
 # ----- Inertias
 
 
+_TOLD = ("inertia", "'friction'", "mechanicalreduction", "unsupported and will be")
+
+
 class _InertiasAreChecked(logging.Filter):
     """Keeps Drake's words about inertias back while it parses: model_inertias.py has
-    looked at them before, and MuJoCo has at those of MJCF."""
+    looked at them before, and MuJoCo has at those of MJCF; and those about elements of
+    which robot_file.py has told once what they mean."""
 
     def filter(self, record: logging.LogRecord) -> bool:
         message = record.getMessage().lower()
-        return "inertia" not in message and "'friction'" not in message
+        return not any(word in message for word in _TOLD)
 
 
 @contextmanager

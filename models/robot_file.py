@@ -138,6 +138,7 @@ def _of_document(document: Any, path: Path, suffix: str, packages) -> RobotFile:
     if suffix == ".urdf":
         name = document.documentElement.getAttribute("name") or path.name.split(".")[0]
         document.documentElement.setAttribute("name", plain_word(name))
+    flat = _without_flat_shapes(document)
     lost: dict[str, Path | None] = {}
     lost_visuals: dict[str, Path | None] = {}
     visuals = collisions = 0
@@ -165,7 +166,7 @@ def _of_document(document: Any, path: Path, suffix: str, packages) -> RobotFile:
                 else:
                     collisions += 1
     make_mesh_paths_absolute(document, path.parent)
-    notes = _cleaned_mimics(document) + _unused(document)
+    notes = flat + _cleaned_mimics(document) + _unused(document)
     if suffix == ".urdf":
         notes += _cleaned_transmissions(document) + _without_commas(document)
         notes += _without_empty_limits(document)
@@ -198,6 +199,20 @@ def _meshes(element: minidom.Element) -> Iterator[tuple]:
             )
         for own in children(mesh, "uri"):
             yield text(own).strip(), lambda uri, own=own: set_text(own, uri)
+
+
+def _without_flat_shapes(document: Any) -> list[str]:
+    """Without cylinders, boxes and others of a size of 0, at which Drake stops."""
+    gone = 0
+    for kind in ("box", "cylinder", "capsule", "ellipsoid"):
+        for shape in list(document.getElementsByTagName(kind)):
+            sizes = [shape.getAttribute(name) for name in ("size", "radius", "length")]
+            sizes += [text(own) for name in ("size", "radius", "length", "radii")
+                      for own in children(shape, name)]  # fmt: skip
+            if re.search(r"(^|\s)0*\.?0+(\s|$)", "  ".join(sizes)):
+                _remove(shape.parentNode.parentNode)
+                gone += 1
+    return [f"{gone} shapes of a size of 0 are left out"] if gone else []
 
 
 def _without_collisions(file: RobotFile) -> str:
@@ -386,7 +401,8 @@ def _cleaned_transmissions(document: minidom.Document) -> list[str]:
 
 def _without_empty_limits(document: minidom.Document) -> list[str]:
     """Of joints whose lower limit is above the upper, which simulators take for none,
-    and of continuous ones, which have none."""
+    or both 0, as exporters of CAD write what nobody filled in, and of continuous ones,
+    which have none."""
     notes = []
     for limit in document.getElementsByTagName("limit"):
         try:
@@ -394,7 +410,8 @@ def _without_empty_limits(document: minidom.Document) -> list[str]:
         except ValueError:
             continue
         joint: Any = limit.parentNode
-        if low > high or joint.getAttribute("type") == "continuous":
+        empty = low > high or low == high == 0.0
+        if empty or joint.getAttribute("type") == "continuous":
             for key in ("lower", "upper"):
                 limit.removeAttribute(key)
             kind, name = (joint.getAttribute(k) for k in ("type", "name"))

@@ -1,6 +1,7 @@
 """Logs with one wrong thing each: it is said, and no mass has to make up for it."""
 
 import json
+import re
 from csv import reader
 from dataclasses import replace
 from io import BytesIO
@@ -282,6 +283,60 @@ def test_efforts_of_another_motion_are_said_to_explain_nothing(tmp_path):
 
     assert "in its joints' order" in judged(tmp_path, other)["effort_unexplained"]
     assert judged(tmp_path, lambda columns: None) == {}
+
+
+def test_a_robot_without_masses_is_refused_by_its_joints(tmp_path):
+    """As a xacro is whose arguments leave them out."""
+    path, log = exact("planar", tmp_path, np.random.default_rng(4))
+    file = csv(tmp_path / "log.csv", {"time": log.time} | log.columns)
+    path.write_text(
+        re.sub("<inertial>.*?</inertial>", "", path.read_text(), flags=re.S)
+    )
+    with pytest.raises(ValueError, match=r"arm.joint1, arm.joint2 moves has no mass"):
+        propose_scene(read_robot(path), [read_log(file)])
+
+
+def driven_by(folder, change) -> tuple[str, dict[str, str]]:
+    """The proposed actuation's type, and why each column is what it is."""
+    path, log = exact("three", folder, np.random.default_rng(4))
+    columns = {"time": log.time} | log.columns
+    change(columns, lambda k: log.truth[f"arm.joint{k}.position"])
+    file = csv(folder / "log.csv", columns)
+    proposal = propose_scene(read_robot(path), [read_log(file)])
+    kind = yaml.safe_load(proposal.scene)["actuation"]["type"]
+    return kind, yaml.safe_load(proposal.sidecars[file])["columns"]
+
+
+def test_positions_commands_drive_where_efforts_do_not_go_with_the_motion(tmp_path):
+    """As the loads that hobby servos report, in steps of a thousandth of the stall."""
+
+    def servos(columns, position):
+        for k in (1, 2, 3):
+            noise = np.random.default_rng(k).normal(size=len(columns["time"]))
+            columns[f"joint{k}_effort"] = noise
+            columns[f"joint{k}_position_command"] = position(k) + 1e-3 * noise
+
+    kind, columns = driven_by(tmp_path, servos)
+    assert kind == "servo" and columns["joint1_effort"] is None
+    assert columns["joint1_position_command"] == "arm.joint1.position_command"
+
+
+@pytest.mark.parametrize("part", [0.3, 1.0])
+def test_commanded_efforts_to_which_a_loop_adds_do_not_drive(tmp_path, part):
+    """A feed-forward that is called the desired torque, beside the measured one."""
+
+    def feed_forward(columns, position):
+        for k in (1, 2, 3):
+            own = columns[f"joint{k}_effort"]
+            columns[f"joint{k}_effort_desired"] = own * part + (1.0 - part) * np.std(
+                own
+            ) * np.sin(3.0 * columns["time"])
+
+    kind, columns = driven_by(tmp_path, feed_forward)
+    assert kind == "effort"
+    own = columns["joint2_effort_desired"]
+    assert own == (None if part < 1.0 else "arm.joint2.effort_command")
+    assert columns["joint2_effort"] == "arm.joint2.effort_measured"
 
 
 @pytest.mark.parametrize(("late", "said"), [(0.03, True), (0.0, False), (-0.03, False)])

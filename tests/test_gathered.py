@@ -76,6 +76,43 @@ def test_a_files_name_says_what_its_columns_are(tmp_path):
     )  # fmt: skip
 
 
+def test_files_that_tell_nothing_of_the_robot_are_left_out_and_said(tmp_path):
+    """A log of events, names of joints, and what cannot be read, in a log's folder."""
+    robot, states, _, _ = robot_and_log(tmp_path)
+    (tmp_path / "log").mkdir()
+    csv_of(tmp_path / "log" / "states.csv", states)
+    events = "type,timestamp,event\nEVENT,0,ENABLE\nEVENT,5.0,START\n"
+    (tmp_path / "log" / "events.csv").write_text(events)
+    (tmp_path / "log" / "joints.txt").write_text("Rotation\nPitch\nElbow\n")
+    (tmp_path / "log" / "empty.csv").touch()
+    recording, notes = proposed(robot, tmp_path)
+    assert len(recording.time) == 1200
+    for name in ("events.csv", "joints.txt"):
+        assert f"{name} is left out: no column is of the robot" in notes
+    assert any(n.startswith("empty.csv is left out: recording ") for n in notes)
+    with pytest.raises(ValueError, match="is empty"):
+        read_logs([tmp_path / "log" / "empty.csv"], robot)
+
+
+@pytest.mark.parametrize("below", [True, False])
+def test_a_file_of_times_alone_is_the_clock_of_those_with_its_rows(tmp_path, below):
+    """Number by number, one below the other, or a row for each instant; no names."""
+    path, log = exact("three", tmp_path, np.random.default_rng(3))
+    (tmp_path / "log").mkdir()
+    np.savetxt(tmp_path / "log" / "run_time.txt", log.time)
+    for word, what in (("positions", "position"), ("torques", "effort")):
+        y = np.stack([log.columns[f"joint{i}_{what}"] for i in (1, 2, 3)], axis=1)
+        name = tmp_path / "log" / f"run_{word}.txt"
+        np.savetxt(name, y.reshape(-1) if below else y)
+    recording, notes = proposed(read_robot(path), tmp_path)
+    assert "run_torques.txt is joined to run_time.txt row by row: one log" in notes
+    np.testing.assert_allclose(recording.time, log.time)
+    for i in (1, 2, 3):
+        for what, ours in (("position", "position"), ("effort", "effort_measured")):
+            logged = log.columns[f"joint{i}_{what}"]
+            np.testing.assert_allclose(recording[f"arm.joint{i}.{ours}"], logged)
+
+
 def test_two_runs_of_one_robot_stay_two_recordings(tmp_path):
     robot, states, _, _ = robot_and_log(tmp_path)
     for name in ("run_command_1.csv", "run_command_2.csv"):

@@ -73,6 +73,13 @@ def test_the_first_line_of_numbers_is_a_row_and_no_header(tmp_path, content):
         read_recording(file)
 
 
+@pytest.mark.parametrize("first", ["-0.9584", "0"])
+def test_a_number_above_numbers_of_one_column_is_the_first_row(tmp_path, first):
+    (tmp_path / "q.txt").write_text("\n".join([first, *map(str, Q)]))
+    table = read_table(tmp_path / "q.txt")
+    np.testing.assert_array_equal(table.columns["column_1"], [float(first), *Q])
+
+
 def test_numbers_that_count_the_columns_are_their_names(tmp_path):
     (tmp_path / "a.csv").write_text(rows(header=("0", "1")))
     (tmp_path / "a.yaml").write_text('columns: {"0": time, "1": a.j.position}')

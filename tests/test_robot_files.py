@@ -398,6 +398,21 @@ def test_vectors_with_commas_are_those_with_blanks(tmp_path):
     np.testing.assert_allclose(mass[1], mass[0], rtol=1e-12)
 
 
+@pytest.mark.parametrize(
+    "shape",
+    ['<cylinder radius="0.1" length="0.0"/>', '<box size="0.1 0 .2"/>',
+     '<cylinder radius="0.10" length="0.05"/>'],
+)  # fmt: skip
+def test_shapes_of_no_size_are_left_out_and_said(tmp_path, shape):
+    path = arm(tmp_path)
+    solid = f"<collision><geometry>{shape}</geometry></collision>"
+    path.write_text(path.read_text().replace("</inertial>", f"</inertial>{solid}", 1))
+    own = read_robot(path)
+    flat = "0.05" not in shape
+    assert own.file.notes == (("1 shapes of a size of 0 are left out",) if flat else ())
+    assert ("<collision>" in own.file.text) != flat
+
+
 def test_what_other_readers_do_not_mind_is_read(tmp_path):
     """A declaration below a blank line, limits the wrong way round, one name of two
     actuators, and a variable of the environment."""
@@ -413,6 +428,8 @@ def test_what_other_readers_do_not_mind_is_read(tmp_path):
     assert own.plant.num_actuators() == 2
     assert np.isinf(own.joints[0].lower) and own.joints[1].lower == -3.0
     assert any("taken to have none" in note for note in own.file.notes)
+    path.write_text(text.replace('lower="1" upper="-1"', 'lower="0" upper="0"', 1))
+    assert np.isinf(read_robot(path).joints[0].upper)  # As exporters of CAD have it.
     wheel = text.replace('lower="1" upper="-1"', 'lower="-1" upper="1"', 1)
     path.write_text(wheel.replace('type="revolute"', 'type="continuous"', 1))
     assert np.isinf(read_robot(path).joints[0].lower)

@@ -385,6 +385,7 @@ def by_content(
     matches = _all_ordered(contents, matches, said)
     matches = _rightly_read(contents, matches, said)
     matches = _drives_that_drive(contents, matches, said)
+    matches = _without_parts(contents, matches, said)
     matches = _with_factors(contents, matches, said)
     matches = _tared(contents, matches, said)
     _unexplained(contents, matches, said)
@@ -850,6 +851,29 @@ def _drives_that_drive(contents: Contents, matches, said) -> list[Match]:
             )
             said.append(Said("no_content", joint.name, share[k], says))
     return out
+
+
+def _without_parts(contents: Contents, matches, said) -> list[Match]:
+    """Without commanded efforts where measured ones go with the motion far better, as
+    where the commands are only a part of what a drive's own loop asks for."""
+    each = [_columns_of(contents, matches, [what]) for what in _DRIVES]
+    there = [i for i in each[0] if i in each[1] and contents.moves(i)]
+    if not there:
+        return matches
+    left = [np.median([contents.told(own[i], i).left for i in there]) for own in each]
+    if not CLEARER * max(left[1], TOLD_WELL) < left[0] or left[1] > 1.0 - EXPLAINS:
+        return matches
+    names = [own[there[0]] for own in each]
+    says = (
+        f"Commanded efforts ({names[0]}) leave {left[0]:.0%} of what the model needs "
+        f"for the motion, measured ones ({names[1]}) {left[1]:.0%}: these are taken "
+        "for what drives the joints."
+    )
+    said.append(Said("no_content", contents.joints[there[0]].name, left[0], says))
+    why = f"effort_command: it leaves {left[0]:.0%} of what the joints need"
+    gone = {*each[0].values()}
+    return [replace(m, channel=None, why=why) if m.column in gone else m
+            for m in matches]  # fmt: skip
 
 
 def _share(contents: Contents, column: str, i: int) -> float:

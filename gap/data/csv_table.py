@@ -300,14 +300,14 @@ def is_nameless(column: str) -> bool:
 
 def _are_values(cells: Sequence[str], separator: str) -> bool:
     """Whether a first line holds a row's numbers rather than names. Whole numbers that
-    count up by one are names, as pandas writes them for want of others."""
+    count up by one are names, as pandas writes several for want of others."""
     texts = [c.replace(",", ".") if separator != "," else c for c in cells if c]
     try:
         values = np.array([float(text) for text in texts])
     except ValueError:
         return False
     counted = all(text.isdigit() for text in texts) and np.all(np.diff(values) == 1.0)
-    return len(values) > 1 and np.isfinite(values).any() and not counted
+    return np.isfinite(values).any() and not (counted and len(values) > 1)
 
 
 def _list(cell: str) -> list[float] | None:

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from makebreak.gap.data.arrays import words_of
-from makebreak.gap.data.joined import joined
+from makebreak.gap.data.csv_table import is_nameless
+from makebreak.gap.data.joined import in_rows_of, joined
 from makebreak.gap.data.proposal import find_time, says_quantity
 from makebreak.gap.data.robot import Log, Robot, matches_of, read_log
 from makebreak.gap.data.table import stem_of
@@ -19,17 +20,47 @@ _SHARE = 0.5  # Of the shorter one's time that two files of one log have in comm
 def read_logs(
     paths: Sequence[Path], robot: Robot, sidecar: Path | None = None
 ) -> list[Log]:
-    """The logs of these files; raises as read_log and gathered."""
-    return gathered([read_log(path, sidecar) for path in paths], robot)
+    """The logs of these files, without those of several that cannot be read, or that
+    tell nothing of the robot, such as a log of events: notes of the first one say so.
+
+    Raises: ValueError, one line, as gathered, and where no position of a joint is left.
+    """
+    read, failed, notes = list[Log](), list[ValueError](), list[str]()
+    for path in paths:
+        try:
+            read.append(read_log(path, sidecar))
+        except ValueError as error:
+            failed.append(error)
+            notes.append(f"{path.name} is left out: {error}")
+    logs = gathered(read, robot)
+    if any(_positions(log, robot) for log in logs):
+        for log in logs:
+            if not (_channels(log, robot, _prefix(log)) or _has_no_names(log)):
+                notes.append(f"{log.path.name} is left out: no column is of the robot")
+                logs = [other for other in logs if other is not log]
+    elif failed:
+        raise failed[0]
+    first = logs[0].sidecar
+    logs[0] = replace(logs[0], sidecar=replace(first, notes=(*first.notes, *notes)))
+    return logs
 
 
 def gathered(logs: Sequence[Log], robot: Robot) -> list[Log]:
     """Logs, with files of one log as one: those of a folder that have a common clock
     and tell different things of the robot, as no column of one says what another one's
-    says already.
+    says already; and those without a time that have the rows of a file with nothing
+    else.
 
     Raises: ValueError for a file without a position whose clock is that of no other.
     """
+    clocks = [log for log in logs if len(log.table.columns) == 1 and _is_timed(log)]
+    for clock in clocks:
+        mine = [log for log in logs if log.path.parent == clock.path.parent
+                and not _is_timed(log) and _has_its_rows(clock, log)]  # fmt: skip
+        for log in mine:
+            logs = [other for other in logs if other not in (clock, log)]
+            clock = _together(clock, log)
+            logs.append(clock)
     whole: list[Log] = []
     for log in sorted(logs, key=lambda log: -_positions(log, robot)):
         fits = [k for k, one in enumerate(whole) if _tell_apart(one, log, robot)]
@@ -81,6 +112,10 @@ def _tell_apart(one: Log, other: Log, robot: Robot) -> bool:
     return bool(a) and bool(b) and not {*a} & {*b}
 
 
+def _has_no_names(log: Log) -> bool:
+    return any(map(is_nameless, log.table.columns))
+
+
 def _span(log: Log) -> tuple[float, float]:
     """First and last time [s]; NaN without a time."""
     said = log.own.get("columns") or {}
@@ -93,10 +128,12 @@ def _span(log: Log) -> tuple[float, float]:
 
 
 def _has_its_rows(one: Log, other: Log) -> bool:
-    """Whether a file without a time has as many rows as one that has it."""
+    """Whether a file without a time has as many rows as one that has it, or so many
+    numbers for each."""
+    same = len(one.table.row) == len(other.table.row)
     return (
         _is_timed(one) and not _is_timed(other)
-        and len(one.table.row) == len(other.table.row)
+        and (same or in_rows_of(one.table, other.table) > 0)
     )  # fmt: skip
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from makebreak.gap.data.csv_table import BadRows, text_columns
+from makebreak.gap.data.csv_table import BadRows, is_nameless, text_columns
 from makebreak.gap.data.proposal import find_time
 from makebreak.gap.data.stamps import is_backward, is_part_of, mended, whole_stamp
 from makebreak.gap.data.table import MOST_CELLS, RecordingTable, is_text, read_table
@@ -72,6 +72,13 @@ def _time_column(names: Mapping) -> str:
     return "time"
 
 
+def in_rows_of(table: RecordingTable, other: RecordingTable) -> int:
+    """How many numbers the one column without a name of another file has for each row,
+    as programs write that print number by number; 0 where it has not."""
+    k, rest = divmod(len(other.row), max(len(table.row), 1))
+    return k if [*map(is_nameless, other.columns)] == [True] and not rest else 0
+
+
 def joined(
     path: Path,
     table: RecordingTable,
@@ -92,11 +99,17 @@ def joined(
     unit, time = (1.0, time) if first is None else (first.scale, first.column)
     tables, notes = [], []
     for file, each in ((path, table), *others):
-        own = dict(each.columns)
+        own = {f"{file.name}:{name}" if file != path and is_nameless(name) else name: y
+               for name, y in each.columns.items()}  # fmt: skip
         if time not in own:
             found = find_time(own)
+            k = in_rows_of(table, each) if time in table.columns else 0
             if found is not None:
                 own = {time: own.pop(found.column) * (found.scale / unit), **own}
+            elif k:
+                ((name, y),) = own.items()
+                own = {f"{name[:-1]}{i + 1}": y[i::k] for i in range(k)}
+                own, each = {time: table.columns[time], **own}, table
             elif time in table.columns and len(each.row) == len(table.row):
                 own = {time: table.columns[time], **own}
             else:

@@ -58,6 +58,7 @@ _BESIDE = set("motor raw unfiltered".split())  # Another column is rather it.
 _EPISODE = set("episode trial run".split())
 _SINCE_1970 = 1e9  # [s]
 _TIME_UNITS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0}
+_MOTION_COMMANDS = ("position_command", "velocity_command")
 # A joint's name with nothing but these is where it is.
 _NOW = set(
     "present actual measured meas act observation obs observed real value ist "
@@ -143,21 +144,24 @@ def said_of(columns: Mapping) -> dict[str, Match]:
 
 
 def of_one_drive(
-    matches: Sequence[Match], of_servos: Collection[str] = ()
+    matches: Sequence[Match],
+    of_servos: Collection[str] = (),
+    unexplained: bool = False,
 ) -> list[Match]:
     """With one kind of command alone: efforts before positions, and before velocities;
     measured efforts stand in for commands of effort. of_servos: channels of measured
-    efforts that are what the position commands' servos give; others drive nothing."""
+    efforts that are what the position commands' servos give; others drive nothing.
+    unexplained: whether efforts do not go with the motion: other commands do."""
     why = "what its position servo gives, and so no other drive"
-    matches = [Match(m.column, None, why=why) if m.channel in of_servos else m
+    gone: set[str | None] = {*of_servos}
+    if unexplained and not gone and not {*_kinds(matches)}.isdisjoint(_MOTION_COMMANDS):
+        why = "it does not go with the motion, and so drives nothing"
+        gone = {m.channel for m in matches if ".effort_" in (m.channel or "")}
+    matches = [Match(m.column, None, why=why) if m.channel in gone else m
                for m in matches]  # fmt: skip
-    kinds = {
-        m.channel.rsplit(".", 1)[1] for m in matches if m.channel and "." in m.channel
-    }
-    if of_servos:
-        kinds.discard("effort_measured")
-    keep = next((k for k in ("effort_command", "effort_measured", "position_command",
-                             "velocity_command") if k in kinds), None)  # fmt: skip
+    kinds = _kinds(matches)
+    drives = ("effort_command", "effort_measured", *_MOTION_COMMANDS)
+    keep = next((k for k in drives if k in kinds), None)
     out = []
     for match in matches:
         what = (match.channel or "").rsplit(".", 1)[-1]
@@ -167,6 +171,11 @@ def of_one_drive(
             match = Match(match.column, None, why=why)
         out.append(match)
     return out
+
+
+def _kinds(matches: Sequence[Match]) -> list[str]:
+    """Of channels."""
+    return [(m.channel or "").rsplit(".", 1)[-1] for m in matches]
 
 
 def sidecar_text(matches: Sequence[Match], own: Mapping | None = None) -> str:

@@ -477,7 +477,8 @@ def judge_logs(robot: Robot, logs: Sequence[Log]) -> Judged:
             own = float(np.nanmax(np.abs(y), initial=0.0))
             most[joint] = max(own, most.get(joint, 0.0))
     given = [f"{joint}.effort_measured" for joint in servos]
-    every = {path: of_one_drive(matches, given) for path, matches in every.items()}
+    unexplained = any(each.kind == UNEXPLAINED for each in said)
+    every = {path: of_one_drive(own, given, unexplained) for path, own in every.items()}
     return Judged(robot, every, fixed, tuple(unused), tuple(said), servos, most)
 
 
@@ -1080,12 +1081,18 @@ def _time_step(robot: Robot, actuation: Sequence[str]) -> float:
 
 def _inertia(robot: Robot) -> dict[str, float]:
     """{joint: inertia [kg m2], or mass [kg], that it moves in the pose of zeros while
-    all other joints are free}."""
+    all other joints are free}. Raises: ValueError where it moves nothing of a mass."""
     plant = robot.plant
-    mobility = np.linalg.inv(plant.CalcMassMatrix(plant.CreateDefaultContext()))
+    M = plant.CalcMassMatrix(plant.CreateDefaultContext())
     own = {
         f"{robot.model}.{j.name()}": j.velocity_start() for j in one_dof_joints(plant)
     }
+    if bare := [name for name, i in own.items() if not M[i, i] > 0.0]:
+        raise ValueError(
+            f"robot {robot.path}: what {', '.join(bare)} moves has no mass "
+            "(<inertial>); a xacro may have it with other arguments: expand it with them"
+        )
+    mobility = np.linalg.inv(M)
     return {name: float(1.0 / mobility[i, i]) for name, i in own.items()}
 
 
