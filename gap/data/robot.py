@@ -1090,7 +1090,7 @@ def _inertia(robot: Robot) -> dict[str, float]:
     if bare := [name for name, i in own.items() if not M[i, i] > 0.0]:
         raise ValueError(
             f"robot {robot.path}: what {', '.join(bare)} moves has no mass "
-            "(<inertial>); a xacro may have it with other arguments: expand it with them"
+            "(<inertial>); a xacro may have it with other arguments: expand it first"
         )
     mobility = np.linalg.inv(M)
     return {name: float(1.0 / mobility[i, i]) for name, i in own.items()}
