@@ -26,11 +26,10 @@ PARTS = 5  # Of the data: each is predicted from the others,
 LARGEST_SPREAD = 0.15  # whose stiffnesses differ by less than this share (1 sigma),
 LEAST_EXPLAINED = 0.8  # and of what the rest leaves the stiffness explains this.
 LAW_LEAVES = 0.01  # Of the variance of an effort that is what its servo gives.
-# Commands are late where each joint's law leaves so many times less for it (by the
-# geometric mean); at most so late [s].
-LATE_LEAVES, MOST_LATE = 4.0, 0.1
-# Of a variance, that means over 0.2 s may leave, and that rounding does.
-BENT, NOTHING = 1e-4, 1e-12
+# Commands are late where the laws' evidence (half a chi-square; rows KERNEL_SEC apart
+# count as independent) grows by so much; at most so late [s].
+LATE_EVIDENCE, MOST_LATE = 10.0, 0.1
+NOTHING = 1e-12  # Of a variance: rounding leaves so much.
 LAW_OFF = 0.03  # Of the gains of a file, which are rather taken than those of a fit.
 
 
@@ -104,27 +103,31 @@ def gains_of_efforts(
     efforts = [motion.effort is not None for motion in motions]
     if not (known and motions and all(efforts) and len(steps) == len(motions)):
         return found
+    independent = sum(float(np.ptp(m.time)) for m in motions) / KERNEL_SEC
     # By rows, where these tell it: means over rows are of something else (below).
     if all(motion.velocity is not None for motion in motions):
         rows = [partial(_law_of_rows, motion) for motion in motions]
-        found = _laws_of(rows, known, min(steps), NOTHING)
+        found = _laws_of(rows, known, min(steps), independent)
     if not all(found):
         rows = [partial(_law_rows, *each)
                 for each in zip(motions, averaged, strict=True)]  # fmt: skip
-        found = _laws_of(rows, known, min(steps), BENT)
+        found = _laws_of(rows, known, min(steps), independent)
     return found
 
 
-def _laws_of(rows_of, known, step: float, least: float) -> list[ServoGains | None]:
+def _laws_of(
+    rows_of, known, step: float, independent: float
+) -> list[ServoGains | None]:
     """The laws from what gives, of each log, each joint's rows for commands that are so
-    late [s]; shares of a variance that are smaller than `least` are as good."""
+    late [s]."""
 
     def laws(late: float) -> list[tuple[float, ServoGains | None]]:
         each = zip(*(rows(late) for rows in rows_of), strict=True)
         return [_law(*one) for one in zip(each, known, strict=True)]
 
     def cost(late: float) -> float:
-        return sum(float(np.log(left)) for left, _ in laws(late))
+        left = sum(float(np.log(left)) for left, _ in laws(late))
+        return 0.5 * independent * left
 
     now = [gains for _, gains in laws(0.0)]
     if all(g and k and g.kp == k[0] for g, k in zip(now, known, strict=True)):
@@ -132,8 +135,7 @@ def _laws_of(rows_of, known, step: float, least: float) -> list[ServoGains | Non
     some = np.arange(0.0, MOST_LATE, step)
     costs = [cost(late) for late in some]
     k = int(np.argmin(costs))
-    most = len(known) * np.log(LATE_LEAVES)
-    if not costs[0] - max(costs[k], len(known) * np.log(least)) > most:
+    if not costs[0] - costs[k] > LATE_EVIDENCE:
         return now
     around = (some[k] - step, some[k] + step)
     found = minimize_scalar(cost, bounds=around, method="bounded")
