@@ -82,7 +82,7 @@ class WhitenedRows(MechanismMotion):
     def _noise_of(self, track: Track, rms, kp, kd) -> dict[str, np.ndarray]:
         """The same of one track; rms (n_v,) of the efforts, kp, kd (n_v,) of drives'
         own loops."""
-        q, v, _ = track.motion_at_middles()
+        q, v, vd = track.motion_at_middles()
         period = track.spacing([f"{j}.position" for j in self.joints])
         g2 = track.bumps.position_noise_gain(period)
         g0 = track.bumps.noise_gain(period)
@@ -99,8 +99,11 @@ class WhitenedRows(MechanismMotion):
         untold = np.where(rest > REST_SHARE, rest, 0.0) * REST_EFFORT * rms
         held = np.maximum(rest * self._dry, untold)
         held = np.where(np.isnan(self._hold), held, rest * self._hold)
-        if self.stops_sec:
-            held = LAW * held
+        # The smoothed velocity's own error, as over one bump.
+        own = self.noise * np.sqrt(period * 12.0 / track.bumps.width**3)
+        if self.stops_sec:  # Of what that law gives, and by the velocity's noise.
+            held *= LAW * track.bumps.mean(np.abs(self._ramp(v, vd)))
+            held = np.hypot(held, rest * own / (self.stops_sec * self._mobility))
         centre = np.clip(
             np.searchsorted(track.middle, track.bumps.centre), 0, len(q) - 1
         )
@@ -112,8 +115,6 @@ class WhitenedRows(MechanismMotion):
             M = M / self._divided_by[:, None]
             C[b] = (M * (g2 * self.noise) ** 2) @ M.T
             C[b] += np.diag(direct[b])
-        # The smoothed velocity's own error, as over one bump.
-        own = self.noise * np.sqrt(period * 12.0 / track.bumps.width**3)
         v_std = np.hypot(self.velocity_noise * g_v * self._together, own)
         swing = DRIVE_VELOCITY * rms_of(v) / self._averaged
         v_std = np.hypot(v_std, np.where(kd > 0.0, swing, 0.0))
@@ -148,9 +149,13 @@ class WhitenedRows(MechanismMotion):
         motion = super().motion(track, effects)
         if not self.stops_sec:
             return motion
+        return replace(motion, dry=self._ramp(motion.v, motion.vd))
+
+    def _ramp(self, v: np.ndarray, vd: np.ndarray) -> np.ndarray:
+        """(n, n_v) share of dry friction that acts where it is not all at once."""
         by_all = self.stops_sec * np.maximum(self._most(self._hold), LEAST_STD)
-        y = motion.v + LEAD * self.stops_sec * motion.vd
-        return replace(motion, dry=np.clip(y / (by_all * self._mobility), -1.0, 1.0))
+        y = v + LEAD * self.stops_sec * vd
+        return np.clip(y / (by_all * self._mobility), -1.0, 1.0)
 
     def _unknown_jumps(self, track: Track) -> np.ndarray:
         """(n_bumps, n_v) standard deviations of means of measured efforts that jump
