@@ -35,7 +35,7 @@ from makebreak.gap.data.check_drives import (
 )
 from makebreak.gap.data.check_meshes import check_meshes
 from makebreak.gap.data.checks import check_recordings
-from makebreak.gap.data.command_clock import moved_sooner
+from makebreak.gap.data.command_clock import in_lines, moved_sooner
 from makebreak.gap.data.conditioning import condition
 from makebreak.gap.data.content import check_contents
 from makebreak.gap.data.effort_loops import OF_LOOP, SHARES, of_loops
@@ -208,6 +208,8 @@ def _run(
         check_against_scene(recording, joints, bodies)
         check_drives(recording, scene)
     recordings = of_loops(as_used(recordings, dynamics))
+    if scene.actuation.hold == "first_order":
+        recordings = [in_lines(r) for r in recordings]
     check_initial_names(scene, recordings)
     check_couplings(scene, dynamics.plant)
     check_meshes(dynamics.loaded, recordings)

@@ -93,7 +93,8 @@ class ActuationSection:
     supply: SupplySection = field(default_factory=SupplySection)
     dead_band: list[Gain] = field(default_factory=list)  # [rad] or [m], to each side.
     resolution: list[Gain] = field(default_factory=list)  # [rad] or [m]
-    hold: Literal["zero_order"] = "zero_order"
+    # A recorded position or velocity command until the next: constant, or on a line.
+    hold: Literal["zero_order", "first_order"] = "zero_order"
     rate_hz: Annotated[float, Between(1.0, 1e5, "Hz")] = 1000.0
 
 

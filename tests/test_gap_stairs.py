@@ -6,7 +6,7 @@ import pytest
 from scipy.linalg import inv
 from test_gap_sticking import encoders, four_joints, goals, log_of
 
-from makebreak.gap.data.command_clock import moved_sooner
+from makebreak.gap.data.command_clock import in_lines, moved_sooner
 from makebreak.gap.data.conditioning import condition
 from makebreak.gap.data.reading import read_recording, read_recordings
 from makebreak.gap.data.table import write_recording
@@ -120,6 +120,25 @@ def test_commands_of_a_faster_loop_go_from_sample_to_sample(tmp_path, times):
     assert moved.period_sec() == pytest.approx(row)
     measured = np.isfinite(moved["a.j.position"])
     np.testing.assert_array_equal(moved["a.j.position"][measured], wanted)
+
+
+def test_commands_in_lines_are_what_lies_between_their_samples(tmp_path):
+    """As a scene's `hold: first_order` says; of efforts nothing changes."""
+    row, n = 0.01, 300
+    time = row * np.arange(n)
+    wanted = np.sin(1.7 * time)
+    file = tmp_path / "r.npz"
+    write_recording(file, {
+        "time": time, "a.j.position_command": wanted, "a.k.effort_command": wanted,
+    })  # fmt: skip
+    lines = in_lines(read_recording(file))
+    t = np.arange(0.1, 2.9, 1e-4) + 3e-5
+    k = np.searchsorted(lines.time, t, "right") - 1
+    off = lines.held("a.j.position_command")[k] - np.interp(t, time, wanted)
+    assert np.abs(off).max() < 1.02 * 1.7 * 0.001  # Half a step of 2 ms, to each side.
+    assert abs(np.mean(off * np.sign(np.cos(1.7 * t)))) < 3e-5
+    held = wanted[np.searchsorted(time, t, "right") - 1]
+    np.testing.assert_array_equal(lines.held("a.k.effort_command")[k], held)
 
 
 def test_a_mean_of_simulated_velocities_is_what_positions_moved():

@@ -20,6 +20,7 @@ from makebreak.gap.data.servo_gains import (
     _fitted,
     _fitted_at,
     gains_of_efforts,
+    go_in_lines,
 )
 from makebreak.gap.simulation.scene_simulation import SceneSimulation
 from makebreak.models.dynamics import SceneDynamics
@@ -703,6 +704,30 @@ def test_efforts_that_are_what_a_servo_gives_tell_its_gains(tmp_path, own):
     assert '"j_effort": null' in sidecar or "j_effort: null" in sidecar
 
 
+@pytest.mark.parametrize("kp", [80.0, 120.0])
+@pytest.mark.parametrize("late", [0.007, 0.01])
+def test_commands_of_a_faster_loop_go_in_lines_where_efforts_say_so(tmp_path, kp, late):
+    """Rows of 10 ms, of the file's servo and of another one. Commands that are a whole
+    row late may hold for it."""
+    servo_log(tmp_path, 80.0, 3.0, None)
+    t = 0.01 * np.arange(1500)
+
+    def told(t):
+        return np.sin(2.0 * t) + 0.05 * np.cos(3.0 * t) + 0.2 * np.sin(7.0 * t)
+
+    q, v = np.sin(2.0 * t), 2.0 * np.cos(2.0 * t)
+    rows = {"time": t, "j_pos": q, "j_vel": v, "j_cmd_pos": told(t),
+            "j_effort": kp * (told(t - late) - q) - 3.0 * v}  # fmt: skip
+    log = tmp_path / "other.csv"
+    np.savetxt(log, np.stack([*rows.values()], 1), delimiter=",",
+               header=",".join(rows), comments="")  # fmt: skip
+    proposal = propose_scene(read_robot(tmp_path / "one.xml"), [read_log(log)])
+    (tmp_path / "scene.yaml").write_text(proposal.scene)
+    actuation = read_scene(tmp_path / "scene.yaml").actuation
+    assert (actuation.hold == "first_order") == (late == 0.007)
+    assert actuation.kp == pytest.approx([kp], rel=0.01)
+
+
 @pytest.mark.parametrize("wrong", [1, 3])
 def test_efforts_of_one_joint_that_are_a_multiple_of_its_servos_are_said(
     tmp_path, wrong
@@ -754,7 +779,7 @@ def test_gains_of_the_file_are_taken_where_parts_of_a_law_nearly_cancel(kp, told
     error = 3.0 / 80.0 * v + 5e-4 * np.sin(5.0 * t)
     effort = kp * error - 3.0 * v
     log = ServoLog(t, q[:, None], (q + error)[:, None], effort[:, None])
-    (found,) = gains_of_efforts([log], [(80.0, 3.0)])
+    (found,), _ = gains_of_efforts([log], [(80.0, 3.0)])
     # Rates averaged over 0.2 s: half a per cent.
     assert found.kp == pytest.approx(told, rel=5e-3)
 
@@ -772,7 +797,10 @@ def test_efforts_tell_gains_beside_late_commands_and_another_zero(known, late):
         return np.stack([own[0] + 0.2 * own[1], 0.4 * own[2] + 0.1 * own[3]], axis=1)
 
     effort = 40.0 * (told(t - late) - q + [0.0, 0.04]) - 2.0 * v
-    found = gains_of_efforts([ServoLog(t, q, told(t), effort)], [known] * 2)
+    log = ServoLog(t, q, told(t), effort)
+    found, by = gains_of_efforts([log], [known] * 2)
+    assert go_in_lines([log], by) == (late > 0.0)
+    assert by == pytest.approx(late, abs=2e-4)
     # Rates averaged over 0.2 s: half a per cent.
     np.testing.assert_allclose([g.kp for g in found], 40.0, rtol=5e-3)
     np.testing.assert_allclose([g.kd for g in found], 2.0, rtol=1e-2)
@@ -797,10 +825,12 @@ def test_efforts_of_a_stiff_loop_tell_gains_where_each_row_has_a_new_command(row
             q += 1e-3 * v
     t, *columns = np.array(rows).T
     log = ServoLog(t, *(x[:, None] for x in columns))
-    (found,) = gains_of_efforts([log], [None])
+    (found,), late = gains_of_efforts([log], [None])
+    assert late == pytest.approx(0.01 * rows_late, abs=1e-4)
+    assert not go_in_lines([log], late)
     assert (found.kp, found.kd) == (pytest.approx(kp), pytest.approx(kd))
     # Means over rows fit as well, with gains that are a tenth off or more.
-    (by_means,) = gains_of_efforts([replace(log, velocity=None)], [None])
+    (by_means,), _ = gains_of_efforts([replace(log, velocity=None)], [None])
     assert by_means.kp != pytest.approx(kp, rel=0.05)
     # Not by more: late commands are told from what means leave by themselves.
     assert by_means.kp == pytest.approx(kp, rel=0.15)
@@ -814,8 +844,8 @@ def test_without_efforts_no_joint_has_gains_by_them():
         ServoLog(t, q, q + 0.1, 40.0 * np.full_like(q, 0.1)),
         ServoLog(t, q, q),
     )
-    assert gains_of_efforts([none], [None, (40.0, 2.0)]) == [None, None]
-    assert gains_of_efforts([whole, none], [None, None]) == [None, None]
+    assert gains_of_efforts([none], [None, (40.0, 2.0)]) == ([None, None], 0.0)
+    assert gains_of_efforts([whole, none], [None, None]) == ([None, None], 0.0)
 
 
 def test_efforts_that_a_servo_does_not_give_drive_the_joints(tmp_path):

@@ -70,15 +70,22 @@ def moved_sooner(recordings: Sequence[Recording], early: float) -> list[Recordin
     return [_sooner(r, early) for r in recordings]
 
 
-def _sooner(r: Recording, early: float) -> Recording:
+def in_lines(recording: Recording) -> Recording:
+    """With position and velocity commands that go from row to row in small steps."""
+    row = recording.period_sec()
+    return _sooner(recording, 0.5 * row, max(round(row / STEP_SEC), 1))
+
+
+def _sooner(r: Recording, early: float, parts: int | None = None) -> Recording:
     names = [c.name for c in r.commands() if c.quantity != "effort_command"]
     row = r.period_sec()
     changed = [_changed(r, episode, names) for episode in r.episodes]
-    apart = np.concatenate([np.zeros(0), *(np.diff(k) for k in changed)])
-    share, parts = early / row, 1
-    if len(apart) and np.mean(apart == 1) > EACH_ROW and abs(share - 0.5) < HALF_WAY:
+    apart = np.concatenate([np.full(1, np.inf), *(np.diff(k) for k in changed)])
+    share = early / row
+    if parts is None and np.mean(apart == 1) > EACH_ROW and abs(share - 0.5) < HALF_WAY:
         faster = 1.0 / max(1.0 - 2.0 * share, 1e-6)
-        parts = max(round(min(faster, row / STEP_SEC)), 1)
+        parts = round(min(faster, row / STEP_SEC))
+    parts = max(parts or 1, 1)
     # The first of the steps from one sample to the next comes with the loop's period.
     off = early - 0.5 * row * (1.0 - 1.0 / parts)
     steps = np.arange(1, parts + 1) / parts

@@ -57,6 +57,7 @@ from makebreak.gap.data.servo_gains import (
     ServoLog,
     effort_shares,
     gains_of_efforts,
+    go_in_lines,
     servo_gains,
 )
 from makebreak.gap.data.sidecar import Found, read_sidecars, sidecar_for
@@ -419,8 +420,9 @@ class Judged:
     """Logs' columns by their names and by what is in them. robot: without joints that
     are taken to stand still, fixed {joint: where}. unused: columns of quantities of
     unknown joints. said: what contents say beside names. servos: {joint: gains} where
-    the measured efforts are what position servos give. most: {joint: the largest effort
-    that was measured or commanded}."""
+    the measured efforts are what position servos give. in_lines: whether, by these,
+    commands are samples of a faster loop. most: {joint: the largest effort that was
+    measured or commanded}."""
 
     robot: Robot
     every: dict[Path, list[Match]]
@@ -428,6 +430,7 @@ class Judged:
     unused: tuple[str, ...]
     said: tuple[Said, ...]
     servos: Mapping[str, ServoGains] = field(default_factory=dict)
+    in_lines: bool = False
     most: Mapping[str, float] = field(default_factory=dict)
 
 
@@ -469,7 +472,7 @@ def judge_logs(robot: Robot, logs: Sequence[Log]) -> Judged:
             if each not in said
             and not (robot.free and each.kind in (FROM_A_START, UNEXPLAINED))
         ]  # fmt: skip
-    servos = _servos_of_efforts(robot, every, logs, said)
+    servos, in_lines = _servos_of_efforts(robot, every, logs, said)
     most: dict[str, float] = {}
     for name, y in (x for log in logs for x in _scaled(log, every[log.path]).items()):
         joint, _, what = name.rpartition(".")
@@ -479,34 +482,38 @@ def judge_logs(robot: Robot, logs: Sequence[Log]) -> Judged:
     given = [f"{joint}.effort_measured" for joint in servos]
     unexplained = any(each.kind == UNEXPLAINED for each in said)
     every = {path: of_one_drive(own, given, unexplained) for path, own in every.items()}
-    return Judged(robot, every, fixed, tuple(unused), tuple(said), servos, most)
+    return Judged(
+        robot, every, fixed, tuple(unused), tuple(said), servos, in_lines, most
+    )
 
 
 def _servos_of_efforts(
     robot: Robot, every, logs, said: list[Said]
-) -> dict[str, ServoGains]:
+) -> tuple[dict[str, ServoGains], bool]:
     """{joint: gains} where all measured efforts are what position servos give: these
-    tell what acts between the rows, too, where a step of a command has its effect. Of
-    few joints whose efforts are a multiple of what the file's gains give, which all
-    others have, that is said: a drive that is weaker shows in the motion, too."""
+    tell what acts between the rows, too, where a step of a command has its effect. And
+    whether, by these, commands go in lines from row to row. Of few joints whose efforts
+    are a multiple of what the file's gains give, which all others have, that is said: a
+    drive that is weaker shows in the motion, too."""
     motions, drives = _motions(robot, every, logs), robot.file.drives
     if not motions:
-        return {}
+        return {}, False
     of_file = [drives.get(j.name.partition(".")[2]) for j in robot.joints]
     known = [
         (own.kp, own.kd) if own is not None and own.kp else None for own in of_file
     ]
-    found = gains_of_efforts(motions, known)
+    found, late = gains_of_efforts(motions, known)
     out = {joint.name: own for joint, own in zip(robot.joints, found, strict=True)
            if own is not None}  # fmt: skip
     if len(out) < len(found):
-        return {}
+        return {}, False
+    in_lines = go_in_lines(motions, late)
     other = {
         name: gains for (name, own), gains in zip(out.items(), known, strict=True)
         if gains is not None and own.kp != gains[0]
     }  # fmt: skip
     if None in known or len(other) > FEW * len(out):
-        return out
+        return out, in_lines
     for name, gains in other.items():
         times = out[name].kp / gains[0]
         says = (
@@ -517,7 +524,7 @@ def _servos_of_efforts(
         )
         said.append(Said("effort_of_other_gains", name, times, says))
         out[name] = ServoGains(*gains, 0.0, 0.0)
-    return out
+    return out, in_lines
 
 
 def _numbered(robot: Robot, logs: Sequence[Log], said: list[Said]) -> Robot:
@@ -965,6 +972,12 @@ def _actuation(judged: Judged, kinds, logs, notes: list[str]) -> tuple[list[str]
             f"no column says what drives {', '.join(rest)}: in this scene nothing does"
         )
     if joints := named("position_command"):
+        held = ["  hold: first_order  # By the measured efforts."]
+        held = held if judged.in_lines else []
+        if held:
+            notes.append(
+                "commands go in straight lines from row to row (by the efforts)"
+            )
         gains = servos or _gains_by_motion(robot, every, logs)
         stiff = {} if servos else _stiffness(robot, every, logs)
         stiff |= {joint: own.kp for joint, own in gains.items()}
@@ -973,7 +986,7 @@ def _actuation(judged: Judged, kinds, logs, notes: list[str]) -> tuple[list[str]
         if all(j in file and drives[j].kp == file[j].kp for j in joints):
             lines = _servos_of_file(robot, joints, file, notes)
             limits = {j: file[j].limit for j in joints}
-            return [*lines, *_limits(limits, judged.most, notes)], ""
+            return [*lines, *held, *_limits(limits, judged.most, notes)], ""
         known = [k for k in stiff.values() if k > 0.0]
         guess = float(np.median(known)) if known else GUESSED_KP
         kp = [float(f"{stiff.get(j, 0.0) or guess:.3g}") for j in joints]
@@ -996,7 +1009,7 @@ def _actuation(judged: Judged, kinds, logs, notes: list[str]) -> tuple[list[str]
         limits = {j: robot.effort_limits.get(j, np.inf) for j in joints}
         most = {j: max(gains[j].most if j in gains else 0.0, judged.most.get(j, 0.0))
                 for j in joints}  # fmt: skip
-        lines += _limits(limits, most, notes)
+        lines += held + _limits(limits, most, notes)
         if every_one and not servos:
             lines.append(f"tolerance: {{drive_gains: {GAINS_KNOWN_TO}}}")
         # A geared motor's own inertia is what its back-EMF and its spring work on.

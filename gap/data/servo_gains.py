@@ -29,6 +29,7 @@ LAW_LEAVES = 0.01  # Of the variance of an effort that is what its servo gives.
 # Commands are late where the laws' evidence (half a chi-square; rows KERNEL_SEC apart
 # count as independent) grows by so much; at most so late [s].
 LATE_EVIDENCE, MOST_LATE = 10.0, 0.1
+BETWEEN = 0.1  # Of a row: commands that are so much later than one do not hold for it.
 NOTHING = 1e-12  # Of a variance: rounding leaves so much.
 LAW_OFF = 0.03  # Of the gains of a file, which are rather taken than those of a fit.
 
@@ -89,37 +90,39 @@ def servo_gains(
 
 def gains_of_efforts(
     motions: Sequence[ServoLog], known: Sequence[tuple[float, float] | None]
-) -> list[ServoGains | None]:
+) -> tuple[list[ServoGains | None], float]:
     """Of each joint, where its measured effort is kp (command - position) - kd velocity
     and nothing else, as of simulated servos and of motors that report what they were
     told to give, from where they take their zero and however late commands reach all of
-    them. None of the others.
+    them. None of the others. And how late that is [s]: of commands that are samples,
+    with a straight line from one to the next.
 
     Args: known: kp and kd of the robot's file: they are taken where they fit as well.
     """
     found: list[ServoGains | None] = [None] * len(known)
+    late = 0.0
     averaged = [averaged_motion(motion) for motion in motions]
     steps = [each[1] for each in averaged if each is not None]
     efforts = [motion.effort is not None for motion in motions]
     if not (known and motions and all(efforts) and len(steps) == len(motions)):
-        return found
+        return found, late
     independent = sum(float(np.ptp(m.time)) for m in motions) / KERNEL_SEC
     # By rows, where these tell it: means over rows are of something else (below).
     if all(motion.velocity is not None for motion in motions):
         rows = [partial(_law_of_rows, motion) for motion in motions]
-        found = _laws_of(rows, known, min(steps), independent)
+        found, late = _laws_of(rows, known, min(steps), independent)
     if not all(found):
         rows = [partial(_law_rows, *each)
                 for each in zip(motions, averaged, strict=True)]  # fmt: skip
-        found = _laws_of(rows, known, min(steps), independent)
-    return found
+        found, late = _laws_of(rows, known, min(steps), independent)
+    return found, late
 
 
 def _laws_of(
     rows_of, known, step: float, independent: float
-) -> list[ServoGains | None]:
+) -> tuple[list[ServoGains | None], float]:
     """The laws from what gives, of each log, each joint's rows for commands that are so
-    late [s]."""
+    late [s]; and how late they are."""
 
     def laws(late: float) -> list[tuple[float, ServoGains | None]]:
         each = zip(*(rows(late) for rows in rows_of), strict=True)
@@ -130,18 +133,25 @@ def _laws_of(
         return 0.5 * independent * left
 
     now = [gains for _, gains in laws(0.0)]
-    if all(g and k and g.kp == k[0] for g, k in zip(now, known, strict=True)):
-        return now  # As the file has them.
     some = np.arange(0.0, MOST_LATE, step)
     costs = [cost(late) for late in some]
     k = int(np.argmin(costs))
     if not costs[0] - costs[k] > LATE_EVIDENCE:
-        return now
+        return now, 0.0
     around = (some[k] - step, some[k] + step)
     found = minimize_scalar(cost, bounds=around, method="bounded")
     # Where commands hold from row to row it is a whole number of these.
     late = float(found.x) if found.fun < costs[k] else float(some[k])
-    return [gains for _, gains in laws(late)]
+    return [gains for _, gains in laws(late)], late
+
+
+def go_in_lines(motions: Sequence[ServoLog], late: float) -> bool:
+    """Whether commands that are so late [s] are samples of a faster loop: they change
+    in most rows, and act between two of these."""
+    row = min(float(np.median(np.diff(m.time))) for m in motions)
+    changes = np.concatenate([(np.diff(m.command, axis=0) != 0.0).any(axis=1)
+                              for m in motions])  # fmt: skip
+    return bool(abs(late / row - round(late / row)) > BETWEEN and changes.mean() > 0.5)
 
 
 def _law_of_rows(motion: ServoLog, late: float):
@@ -198,8 +208,11 @@ def _law(
     c, root = nnls(X / size, y)
     kp, *rates = c / size
     left = max(float(root**2) / whole, NOTHING)
-    good = kp > 0.0 and left < LAW_LEAVES
-    return left, ServoGains(float(kp), float(sum(rates)), 0.0, 0.0) if good else None
+    if not (kp > 0.0 and left < LAW_LEAVES):
+        return left, None
+    if known is not None and abs(kp - known[0]) < LAW_OFF * known[0]:
+        return left, ServoGains(*known, 0.0, 0.0)
+    return left, ServoGains(float(kp), float(sum(rates)), 0.0, 0.0)
 
 
 def _joints(plant: MultibodyPlant) -> list:
