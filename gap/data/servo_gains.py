@@ -211,7 +211,7 @@ def _law(
     if not (kp > 0.0 and left < LAW_LEAVES):
         return left, None
     if known is not None and abs(kp - known[0]) < LAW_OFF * known[0]:
-        return left, ServoGains(*known, 0.0, 0.0)
+        return left, ServoGains(known[0], known[1], 0.0, 0.0)
     return left, ServoGains(float(kp), float(sum(rates)), 0.0, 0.0)
 
 
