@@ -6,8 +6,7 @@ that include themselves).
 
 import logging
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -35,6 +34,7 @@ from makebreak.models.fixed_joints import couplings_in, fix_joints
 from makebreak.models.model_inertias import ModelText, mended
 from makebreak.models.robot_file import (
     RobotFile,
+    checked_inertias,
     is_robot,
     path_of,
     read_robot_file,
@@ -308,29 +308,6 @@ def _check_includes(
 
 
 # ----- Inertias
-
-
-_TOLD = ("inertia", "'friction'", "mechanicalreduction", "unsupported and will be")
-
-
-class _InertiasAreChecked(logging.Filter):
-    """Keeps Drake's words about inertias back while it parses: model_inertias.py has
-    looked at them before, and MuJoCo has at those of MJCF; and those about elements of
-    which robot_file.py has told once what they mean."""
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        message = record.getMessage().lower()
-        return not any(word in message for word in _TOLD)
-
-
-@contextmanager
-def checked_inertias() -> Iterator[None]:
-    log, quiet = logging.getLogger("drake"), _InertiasAreChecked()
-    log.addFilter(quiet)
-    try:
-        yield
-    finally:
-        log.removeFilter(quiet)
 
 
 def _with_mended_inertias(

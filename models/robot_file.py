@@ -5,9 +5,11 @@ that cannot be used are left out. What the file says and Drake keeps no place fo
 handed on as effects (friction, rotors, springs); what nobody uses is a note.
 """
 
+import logging
 import os
 import re
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -16,7 +18,8 @@ from xml.dom import expatbuilder, minidom
 from xml.parsers.expat import ExpatError
 
 import numpy as np
-from pydrake.multibody.parsing import PackageMap
+from pydrake.multibody.parsing import PackageMap, Parser
+from pydrake.multibody.plant import MultibodyPlant
 
 from makebreak.models.effects.kind import Effect
 from makebreak.models.effects.model_text import (
@@ -30,6 +33,7 @@ from makebreak.models.mjcf import FileDrive, plain_mjcf
 
 ROBOTS = (".urdf", ".sdf", ".xml", ".xacro")
 # Limits that only a controller of the robot's maker knows.
+_WORDS_MAX = 30  # Kinds of words that an SDF may have of its own.
 _UNUSED = {
     "safety_controller": "limits of the robot's own controller; motion is limited by "
     "<limit> alone",
@@ -172,7 +176,7 @@ def _of_document(document: Any, path: Path, suffix: str, packages) -> RobotFile:
         notes += _without_empty_limits(document)
         _clean_materials(document)
     else:
-        notes += _without_bullets_own(document)
+        notes += _as_gazebo_reads(document) + _without_undefined(document)
     effects, more = _of_joints(document)
     limits, passive = _drives(document)
     return RobotFile(
@@ -293,9 +297,9 @@ def path_of(uri: str, near: Path, packages: PackageMap) -> Path | None:
 
 def package_near(name: str, near: Path, inside: Path) -> Path | None:
     """A package's folder: one above a file, or beside one above, whose name, or whose
-    package.xml, is the package's; one of ROS's paths; or, where the file of it is
-    there, a folder above that bears another name. The first that has the file inside
-    it, else the first."""
+    package.xml, is the package's; one of ROS's paths, or below a workspace's `src` or a
+    checkout that the file is in; or, where the file of it is there, a folder above that
+    bears another name. The first that has the file inside it, else the first."""
     first = None
     for folder in _candidates(name, near):
         if (folder / inside).exists():
@@ -319,7 +323,8 @@ def _candidates(name: str, near: Path) -> Iterator[Path]:
     for prefix in _listed("AMENT_PREFIX_PATH"):
         if (prefix / "share" / name).is_dir():
             yield prefix / "share" / name
-    for root in _listed("ROS_PACKAGE_PATH"):
+    spaces = [f for f in above if f.name == "src" or (f / ".git").exists()]
+    for root in (*_listed("ROS_PACKAGE_PATH"), *spaces):
         if root.name == name or _is_package(root, name):
             yield root
         looked = 0
@@ -422,31 +427,59 @@ def _without_empty_limits(document: minidom.Document) -> list[str]:
     return notes
 
 
-# Elements of (parent), and attributes, that PyBullet has and SDF does not.
-_BULLETS = (("link", "contact"), ("collision", "material"))
-_BULLETS_MARKS = (("collision", "concave"),)
+_UNDEFINED = re.compile(
+    r"XML (?:Element\[(\w+)\], child of|Attribute\[(\w+)\] in) element\[(\w+)\],? not"
+)
 
 
-def _without_bullets_own(document: minidom.Document) -> list[str]:
-    """An SDF without what is PyBullet's own, at which Drake stops; an empty link called
-    world is the world."""
-    gone = dict[str, None]()
+def _without_undefined(document: minidom.Document) -> list[str]:
+    """An SDF without words that SDF does not have, such as PyBullet's own, at which
+    Drake stops: one kind after the other."""
+    gone: list[str] = []
+    while len(gone) < _WORDS_MAX:
+        try:
+            with checked_inertias():
+                plant = MultibodyPlant(0.0)
+                Parser(plant).AddModelsFromString(document.toxml(), "sdf")
+        except RuntimeError as error:
+            if (found := _UNDEFINED.search(str(error))) is None:
+                break
+        else:
+            break
+        name, mark, parent = found.groups()
+        if mark == "relative_to":
+            break  # Where something is may not change.
+        for element in document.getElementsByTagName(parent):
+            for own in children(element, name or ""):
+                _remove(own)
+            if mark and element.hasAttribute(mark):
+                element.removeAttribute(mark)
+        gone.append(f"<{name}> of <{parent}>" if name else f"{mark} of <{parent}>")
+    return [f"{', '.join(gone)}: no words of SDF, which are left out"] if gone else []
+
+
+def _as_gazebo_reads(document: minidom.Document) -> list[str]:
+    """An SDF without what Gazebo or PyBullet do not mind and Drake stops at: joints
+    with a link's name, materials, a link as the frame of its own inertia, and an empty
+    link called world, which is the world."""
+    notes = []
     for link in document.getElementsByTagName("link"):
         if link.getAttribute("name") == "world" and not children(link, "inertial"):
             _remove(link)
-    for parent, name in _BULLETS:
-        for element in list(document.getElementsByTagName(name)):
-            if getattr(element.parentNode, "tagName", "") == parent:
-                _remove(element)
-                gone[f"<{name}> of a {parent}"] = None
-    for element_name, mark in _BULLETS_MARKS:
-        for element in document.getElementsByTagName(element_name):
-            if element.hasAttribute(mark):
-                element.removeAttribute(mark)
-                gone[f"{mark} of a {element_name}"] = None
-    if not gone:
-        return []
-    return [f"{', '.join(gone)}: PyBullet's own words, which are left out"]
+    links = {e.getAttribute("name") for e in document.getElementsByTagName("link")}
+    for joint in document.getElementsByTagName("joint"):
+        if (name := joint.getAttribute("name")) in links:
+            joint.setAttribute("name", f"{name}_joint")
+            notes.append(f"joint {name} has a link's name: it is called {name}_joint")
+    for inertial in document.getElementsByTagName("inertial"):
+        own: Any = inertial.parentNode
+        for pose in children(inertial, "pose"):
+            if pose.getAttribute("relative_to") == own.getAttribute("name"):
+                pose.removeAttribute("relative_to")
+    for visual in document.getElementsByTagName("visual"):
+        for material in children(visual, "material"):
+            _remove(material)
+    return notes
 
 
 def _without_commas(document: minidom.Document) -> list[str]:
@@ -558,3 +591,28 @@ def _of_joints(document: minidom.Document):
             "motor's side each sidecar entry needs the ratio as its scale"
         )
     return tuple(effects), notes
+
+
+# ----- Drake's warnings
+
+_TOLD = ("inertia", "'friction'", "mechanicalreduction", "unsupported and will be")
+
+
+class _InertiasAreChecked(logging.Filter):
+    """Keeps Drake's words about inertias back while it parses: model_inertias.py has
+    looked at them before, and MuJoCo has at those of MJCF; and those about elements of
+    which a note has told once what they mean."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        message = record.getMessage().lower()
+        return not any(word in message for word in _TOLD)
+
+
+@contextmanager
+def checked_inertias() -> Iterator[None]:
+    log, quiet = logging.getLogger("drake"), _InertiasAreChecked()
+    log.addFilter(quiet)
+    try:
+        yield
+    finally:
+        log.removeFilter(quiet)

@@ -90,8 +90,42 @@ def test_an_sdf_with_pybullets_own_words_is_read(tmp_path):
     assert [j.name for j in own.joints] == ["g.base_joint"] and not own.bases
     (note,) = own.file.notes
     assert note == (
-        "<contact> of a link, <material> of a collision, concave of a collision: "
-        "PyBullet's own words, which are left out"
+        "<contact> of <link>, concave of <collision>, <material> of <collision>: "
+        "no words of SDF, which are left out"
+    )
+
+
+def test_a_package_elsewhere_in_a_workspace_is_found(tmp_path):
+    """As a planner's configuration names the description that it is of."""
+    own = tmp_path / "ws" / "src" / "descriptions" / "arm_description"
+    own.mkdir(parents=True)
+    (own / "package.xml").write_text("<package><name>arm_description</name></package>")
+    arm(own)
+    near = tmp_path / "ws" / "src" / "planning" / "config" / "planned.urdf.xacro"
+    near.parent.mkdir(parents=True)
+    near.write_text(
+        '<robot name="arm" xmlns:xacro="http://ros.org/wiki/xacro"><xacro:include '
+        'filename="$(find arm_description)/arm.urdf"/></robot>'
+    )
+    assert len(read_robot(near).joints) == 2
+
+
+def test_an_sdf_as_gazebo_reads_it_is_read(tmp_path):
+    """A joint with a link's name, a link as the frame of its own inertia, a material
+    without a file, and a limit that is not where SDF has it."""
+    path = tmp_path / "wheel.sdf"
+    path.write_text("""<sdf version="1.7"><model name="w"><link name="base"/>
+<link name="wheel"><inertial><pose relative_to="wheel">0 0 0.1 0 0 0</pose><mass>2
+</mass></inertial><visual name="v"><geometry><sphere><radius>1</radius></sphere>
+</geometry><material><script><name>Red</name></script></material></visual></link><joint
+name="wheel" type="revolute"><parent>base</parent><child>wheel</child><axis><xyz>0 0 1
+</xyz><lower>-1</lower></axis></joint></model></sdf>""")
+    own = read_robot(path)
+    assert [j.name for j in own.joints] == ["w.wheel_joint"]
+    assert own.plant.GetBodyByName("wheel").default_mass() == 2.0
+    assert own.file.notes == (
+        "joint wheel has a link's name: it is called wheel_joint",
+        "<lower> of <axis>: no words of SDF, which are left out",
     )
 
 
