@@ -53,6 +53,7 @@ from makebreak.systems.contact_mpc.numerics.rolling_task import (
     UnseenConfig,
 )
 from makebreak.systems.contact_mpc.rolling_task import RollingTaskConfig
+from makebreak.systems.numerics.timing import UpdateTimes
 from makebreak.systems.perception.camera_shake import CameraShake
 from makebreak.systems.perception.noisy_sensor import NoisySensor
 
@@ -114,9 +115,9 @@ class Run:
 
 def updates(diagram):
     return {
-        s.get_name(): len(s.compute_sec)
+        s.get_name(): s.update_times.updates
         for s in diagram.GetSystems()
-        if hasattr(s, "compute_sec")
+        if hasattr(s, "update_times")
     }
 
 
@@ -133,8 +134,8 @@ def rolling(diagram):
     too large, so the tip is about to push where nothing is."""
     run = Run(diagram)
     for system in diagram.GetSystems():
-        if hasattr(system, "compute_sec"):
-            system.compute_sec.clear()
+        if hasattr(system, "update_times"):
+            system.update_times = UpdateTimes()
     start = run.to(0.1).memory()
     count = run.to(0.5) and updates(diagram)
     # One tick into the roll: the line that led to the landing is over.

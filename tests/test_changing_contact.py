@@ -44,6 +44,7 @@ from makebreak.systems.changing_contact.numerics.motion_pattern import (
     MotionPattern,
     Segment,
 )
+from makebreak.systems.numerics.timing import UpdateTimes
 
 START = np.array([0.42, -0.16, 0.195])  # Of the sphere's centre [m].
 RAISED = 0.095  # The table, so that the way down is short [m].
@@ -121,14 +122,14 @@ def trial():
     """One whole motion. Returns: diagram, context at its end, telemetry, counts."""
     diagram = build()
     for system in diagram.GetSystems():
-        if hasattr(system, "compute_sec"):
-            system.compute_sec.clear()
+        if hasattr(system, "update_times"):
+            system.update_times = UpdateTimes()
     simulator = Simulator(diagram)
     simulator.AdvanceTo(0.5)
     counts = {
-        s.get_name(): len(s.compute_sec)
+        s.get_name(): s.update_times.updates
         for s in diagram.GetSystems()
-        if hasattr(s, "compute_sec")
+        if hasattr(s, "update_times")
     }
     middle = simulator.get_context().Clone()
     simulator.AdvanceTo(4.0)

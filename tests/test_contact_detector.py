@@ -133,7 +133,7 @@ def run(world, limits=None):
     limits = limits or Thresholds()
     memory, contact, rows = new_memory(), np.zeros(N_CONTACT), []
     for i in range(len(world.pose)):
-        memory, contact = detect(
+        detect(
             limits,
             memory,
             contact,
@@ -145,7 +145,7 @@ def run(world, limits=None):
             world.n[i],
             world.phase[i],
         )
-        rows.append(contact)
+        rows.append(contact.copy())
     return np.array(rows)
 
 

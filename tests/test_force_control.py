@@ -534,9 +534,9 @@ def test_damping_rule_is_the_critical_one_times_its_ratio(law, chain, ratio):
 
 
 def run_ticks(chain, law, n, state, directions, targets, measured=None):
-    tau, memory = state
+    tau, memory = (each.copy() for each in state)
     for _ in range(n):
-        tau, status, memory = tick(
+        status = tick(
             packed(chain), packed(law), tau, memory,
             law.q_nominal, np.zeros(7), reference(), law.stiffness, law.damping, 0.0,
             np.zeros(6), directions, targets,

@@ -122,7 +122,7 @@ def arm_run(law, reference, seconds, rng, motor=None, push=None):
         read_q, read_v = q + 1e-5 * rng.normal(size=7), v + 1e-3 * rng.normal(size=7)
         x_d = np.zeros(19)
         x_d[:3], x_d[3] = reference(k * TICK), 1.0
-        tau, status, memory = tick(
+        status = tick(
             PACKED_CHAIN, PACKED_LAW, tau, memory, read_q, read_v, x_d, law.stiffness,
             law.damping, 0.0, np.zeros(6), np.zeros(6), np.zeros(2), np.zeros(6), 0.0,
         )  # fmt: skip
@@ -131,7 +131,7 @@ def arm_run(law, reference, seconds, rng, motor=None, push=None):
         given = given if push is None else given + push(k * TICK)
         v = v + TICK * np.linalg.solve(s.M, given - s.bias)
         q = q + TICK * v
-        rows.append((v, q, tau, int(status)))
+        rows.append((v, q, tau.copy(), int(status)))
     return tuple(np.array(each) for each in zip(*rows, strict=True))
 
 

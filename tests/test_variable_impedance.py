@@ -46,11 +46,10 @@ def law_of(**changes):
 
 def run(law, inputs, memory=None):
     """Outputs (n, N_OUTPUT) of ticks over (error, predicted, collecting, phase)."""
-    memory = np.zeros(N_MEMORY) if memory is None else memory
+    memory = np.zeros(N_MEMORY) if memory is None else memory.copy()
     rows = []
     for one in inputs:
-        memory, output = tick(law, memory, *one)
-        rows.append(output)
+        rows.append(tick(law, memory, *one))
     return np.array(rows)
 
 

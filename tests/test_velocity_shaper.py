@@ -111,9 +111,8 @@ def follow(
         if feel is not None:
             felt = feel(t, felt.copy(), rows)
         result = tick(pattern.table, law, regions, memory, t, felt, measured)
-        memory = result[0]
-        rows.append((t, *result[1:]))
-        X, phase = result[1], result[5]
+        rows.append((t, *result))
+        X, phase = result[0], result[4]
         if waiting and phase[0] == waiting[0][0]:
             _, d, where = waiting[0]
             if X[0, :3] @ d >= where:
@@ -611,7 +610,7 @@ def test_the_system_gives_what_the_numerics_give():
         t = i * DT
         if i % 10 == 0:
             regions = plan(LINE.table, LAW, memory, t, rows)
-        memory, X, *_, phase = tick(
+        X, *_, phase = tick(
             LINE.table, LAW, regions, memory, t, np.zeros(14), np.zeros(7)
         )
     simulator.AdvanceTo(2000 * DT - 0.5 * DT)

@@ -32,14 +32,14 @@ STD = np.array([0.1] * 3 + [0.01] * 3)
 
 def after(wrenches, velocities=REST, rows=FREE, memory=None, law=LAW):
     """The memory after a sample per row of wrenches (n, 6)."""
-    memory = new_memory() if memory is None else memory
+    memory = new_memory() if memory is None else memory.copy()
     n = len(wrenches)
     velocities, rows = (
         np.broadcast_to(velocities, (n, 6)),
         np.broadcast_to(rows, (n, 6)),
     )
     for sample in zip(wrenches, velocities, rows, strict=True):
-        memory = tick(law, memory, *(np.array(value) for value in sample))
+        tick(law, memory, *(np.array(value) for value in sample))
     return memory
 
 

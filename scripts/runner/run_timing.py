@@ -3,6 +3,8 @@
 import numpy as np
 from pydrake.systems.framework import Diagram, System
 
+from makebreak.systems.numerics.timing import UpdateTimes
+
 
 def leaf_systems(system: System):
     """All leaf systems of a diagram, those of nested diagrams too."""
@@ -30,9 +32,8 @@ class RunTiming:
     def start(diagram: Diagram) -> None:
         """Forgets what the diagram's systems took before."""
         for system in leaf_systems(diagram):
-            if hasattr(system, "compute_sec"):
-                system.compute_sec.clear()
-                system.compute_cpu_sec.clear()
+            if hasattr(system, "update_times"):
+                system.update_times = UpdateTimes()
 
     def note(
         self, label: str, diagram: Diagram, simulated: float, wall: float, cpu: float
@@ -50,21 +51,21 @@ class RunTiming:
             "systems": {},
         }
         for system in leaf_systems(diagram):
-            ms = 1e3 * np.array(getattr(system, "compute_sec", ()))
-            if ms.size:
+            times = getattr(system, "update_times", None)
+            if times is not None and times.updates:
                 name = system.get_name()  # Unique in one diagram, not in nested ones.
                 if name in entry["systems"]:
                     name = system.GetSystemPathname()
-                cpu_ms = 1e3 * np.array(system.compute_cpu_sec)
-                period_ms = 1e3 * simulated / ms.size
+                ms, cpu_ms = 1e3 * np.array([times.wall_sec, times.cpu_sec])
+                period_ms = 1e3 * simulated / times.updates
                 entry["systems"][name] = {
-                    "updates": int(ms.size),
+                    "updates": times.updates,
+                    "timed": len(ms),  # Some of them, see timing.py.
                     "period_ms": period_ms,
                     "p50_ms": float(np.percentile(ms, 50)),
                     "p99_ms": float(np.percentile(ms, 99)),
                     "max_ms": float(ms.max()),
                     "overruns": int((ms > period_ms).sum()),
-                    "cpu_updates": int(cpu_ms.size),  # Some, see timed.
                     "cpu_p50_ms": float(np.percentile(cpu_ms, 50)),
                     "cpu_p99_ms": float(np.percentile(cpu_ms, 99)),
                     "cpu_overruns": int((cpu_ms > period_ms).sum()),
@@ -80,7 +81,7 @@ class RunTiming:
                 if system["cpu_p99_ms"] > system["period_ms"]:
                     lines[name] = (
                         f"Too slow for real time: {name}, {system['cpu_overruns']} of "
-                        f"{system['cpu_updates']} updates took more CPU time than its "
+                        f"{system['timed']} updates took more CPU time than its "
                         f"period of {system['period_ms']:.3g} ms "
                         f"(99 %: {system['cpu_p99_ms']:.3g})"
                     )

@@ -277,7 +277,7 @@ class ImpedanceController(LeafSystem):
             directions = self._directions.Eval(context)
             targets = self._or(self._targets, context, self._no_targets)
             measured = self._or(self._measured, context, self._no_wrench)
-        tau, status, memory = tick(
+        status = tick(
             *self._packed,
             discrete_state.get_mutable_value(self._tau),
             discrete_state.get_mutable_value(self._memory),
@@ -293,9 +293,7 @@ class ImpedanceController(LeafSystem):
             measured,
             delay,
         )
-        discrete_state.set_value(self._tau, tau)
         discrete_state.set_value(self._status, [status])
-        discrete_state.set_value(self._memory, memory)
 
     def _or(self, port, context, otherwise):
         return port.Eval(context) if port.HasValue(context) else otherwise

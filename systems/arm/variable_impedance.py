@@ -156,16 +156,15 @@ class VariableImpedance(LeafSystem):
         handing_over = 0.0
         if self._handing_over.HasValue(context):
             handing_over = self._handing_over.Eval(context)[0]
-        memory, output = tick(
+        output = tick(
             self._law,
-            discrete_state.value(self._memory),
+            discrete_state.get_mutable_value(self._memory),
             self._error.Eval(context)[0],
             self._predicted.Eval(context),
             self._collecting.Eval(context)[0],
             self._phase.Eval(context),
             handing_over,
         )
-        discrete_state.set_value(self._memory, memory)
         discrete_state.set_value(self._stiffness, output[:6])
         damping = output[6:12]
         discrete_state.set_value(

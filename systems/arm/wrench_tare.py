@@ -116,6 +116,5 @@ class WrenchTare(LeafSystem):
 
     @timed
     def _update(self, context: Context, discrete_state):
-        memory = discrete_state.value(self._memory)
-        memory = tick(self._law, memory, *[p.Eval(context) for p in self._ports])
-        discrete_state.set_value(self._memory, memory)
+        memory = discrete_state.get_mutable_value(self._memory)
+        tick(self._law, memory, *[p.Eval(context) for p in self._ports])

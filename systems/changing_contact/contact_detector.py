@@ -108,12 +108,10 @@ class ContactDetector(LeafSystem):
 
     @timed
     def _update(self, context: Context, discrete_state):
-        memory, contact = detect(
+        detect(
             self._limits,
-            discrete_state.value(self._memory),
-            discrete_state.value(self._contact),
+            discrete_state.get_mutable_value(self._memory),
+            discrete_state.get_mutable_value(self._contact),
             context.get_time(),
             *[port.Eval(context) for port in self._ports],
         )
-        discrete_state.set_value(self._memory, memory)
-        discrete_state.set_value(self._contact, contact)

@@ -155,7 +155,7 @@ class VelocityShaper(LeafSystem):
         )
         # Before the first update: at rest, before the pattern's first time.
         before = pattern.segments[0].times[0] - 1.0
-        _, X, *rest = tick(
+        X, *rest = tick(
             pattern.table,
             law,
             np.zeros(N_REGIONS),
@@ -226,20 +226,18 @@ class VelocityShaper(LeafSystem):
         t, law = context.get_time(), self._law
         contact, pose = self._contact.Eval(context), self._ee_pose.Eval(context)
         regions = discrete_state.value(self._regions)
-        memory = discrete_state.value(self._memory)
+        memory = discrete_state.get_mutable_value(self._memory)
         table, old = self._pattern.table, None
         if self._motion.HasValue(context):
             patterns = self._now(context)
             table, old = patterns.now.table, patterns.old
-        memory, X, *rest = tick(table, law, regions, memory, t, contact, pose)
+        X, *rest = tick(table, law, regions, memory, t, contact, pose)
         if old is not None and t < patterns.t + patterns.T:
-            before = discrete_state.value(self._memory_old)
-            before, X_old, *_ = tick(
+            before = discrete_state.get_mutable_value(self._memory_old)
+            X_old, *_ = tick(
                 old.table, law, self._no_regions, before, t, self._no_contact, pose
             )
-            discrete_state.set_value(self._memory_old, before)
             X = blended(X_old, X, t - patterns.t, patterns.T)
-        discrete_state.set_value(self._memory, memory)
         discrete_state.set_value(self._outputs[0], pose_output(X, self._pattern.base))
         for state, value in zip(self._outputs[1:], rest, strict=True):
             discrete_state.set_value(state, value)

@@ -3,45 +3,56 @@
 For diagnostics only, never an input of the simulation.
 """
 
-from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from functools import wraps
 from time import perf_counter, thread_time
 
 _observers: list[Callable] = []
-# Least time between two questions for a thread's CPU time [s]: they go to the kernel,
-# and asked twice in each update they would take a twentieth of a whole simulation.
-_CPU_EVERY = 0.005
+# Least time between two calls of an update that are timed [s]. A thread's CPU time is
+# asked of the kernel: to time each update took a fortieth of a whole simulation.
+_EVERY = 0.005
+
+
+@dataclass
+class UpdateTimes:
+    """How often a system was updated, and how long some of the updates took."""
+
+    updates: int = 0
+    wall_sec: list[float] = field(default_factory=list)
+    cpu_sec: list[float] = field(default_factory=list)  # Of the same updates.
+    next: float = 0.0  # The clock's time from which on one is timed again [s].
 
 
 def timed(update):
-    """Decorates an update callback: each call's duration [s] is appended to the
-    system's `compute_sec`, and the CPU time of its thread [s], which other processes do
-    not lengthen, to `compute_cpu_sec`: of the first call, and of one call every 5 ms.
+    """Decorates an update callback: `update_times` of the system counts its calls, and
+    has duration and CPU time of the thread [s], which other processes do not
+    lengthen, of the first call and of one call every 5 ms.
 
-    They are attributes of the system, not in the Context: they describe the computer,
-    and nothing in the simulation may read them.
+    It is an attribute of the system, not in the Context: it describes the computer, and
+    nothing in the simulation may read it.
     """
 
     @wraps(update)
     def wrapper(self, context, *args):
         for observer in _observers:
             observer(self, context)
-        if not hasattr(self, "compute_sec"):
-            self.compute_sec = deque(maxlen=1_000_000)
-            self.compute_cpu_sec = deque(maxlen=1_000_000)
-            self._cpu_from = 0.0
+        try:
+            times = self.update_times
+        except AttributeError:
+            times = self.update_times = UpdateTimes()
+        times.updates += 1
         start = perf_counter()
-        asks = start >= self._cpu_from or not self.compute_cpu_sec
-        cpu = thread_time() if asks else 0.0
+        if start < times.next:
+            return update(self, context, *args)
+        cpu = thread_time()
         try:
             return update(self, context, *args)
         finally:
-            if asks:
-                self.compute_cpu_sec.append(thread_time() - cpu)
-                self._cpu_from = start + _CPU_EVERY
-            self.compute_sec.append(perf_counter() - start)
+            times.cpu_sec.append(thread_time() - cpu)
+            times.wall_sec.append(perf_counter() - start)
+            times.next = start + _EVERY
 
     return wrapper
 

@@ -499,17 +499,16 @@ def tick(
     measured,
     delay,
 ):
-    """One tick of the controller.
+    """One tick of the controller, which changes tau and memory in place.
 
     Args: packed_chain, packed_law: SerialChain and Law (packed.py); tau (n,): of the
         last tick; memory: of memory_size; others as in impedance_torque and
         force_control; any of them may contain NaN. delay: from a reading to the time
         when its torque acts [s]; no time (NaN, negative, infinite) counts as 0.
-    Returns: tau (n,) within all limits, status (bits), memory.
+    Returns: status (bits). tau is within all limits.
     """
     chain, law = chain_of(packed_chain), law_of(packed_law)
     n = q.shape[0]
-    memory = memory.copy()
     status = 0
     count = memory[2 * n + 7]
     has_pose, has_q = memory[2 * n + 8] > 0.0, memory[2 * n + 9] > 0.0
@@ -591,7 +590,8 @@ def tick(
         kept, by = braked(law, tau, out, q_now, v_now, now.M, now.bias, delay)
         if np.all(np.isfinite(kept)):  # Else an overflow.
             out, limited = kept, limited | by
-    return out, status | limited, memory
+    tau[:] = out
+    return status | limited
 
 
 @numba.njit(cache=True)

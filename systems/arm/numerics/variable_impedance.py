@@ -75,7 +75,7 @@ def trust(error, steepness, midpoint):
 
 @numba.njit(cache=True)
 def tick(law, memory, error, predicted, collecting, phase, handing_over=0.0):
-    """One tick.
+    """One tick, which changes the memory in place.
 
     Args:
         law: StiffnessLaw. memory (N_MEMORY,), zero at first.
@@ -86,9 +86,8 @@ def tick(law, memory, error, predicted, collecting, phase, handing_over=0.0):
         handing_over: 1 while W is the mean of an earlier model for the place that is
             reached now, which is filtered less than a single noisy prediction.
         NaN in an input gives K_max, no feed-forward, or the base controller.
-    Returns: memory, and output (N_OUTPUT,).
+    Returns: output (N_OUTPUT,).
     """
-    memory = memory.copy()
     output = np.empty(N_OUTPUT)
     status = 0
     weight = 0.0
@@ -156,13 +155,12 @@ def tick(law, memory, error, predicted, collecting, phase, handing_over=0.0):
     output[12:18] = memory[FEEDFORWARD]
     output[18] = weight
     output[19] = status
-    return memory, output
+    return output
 
 
 def warm_up(law: StiffnessLaw) -> None:
-    """Compiles the tick for a read-only memory, as a Context's state is."""
+    """Compiles the tick."""
     memory = np.zeros(N_MEMORY)
-    memory.setflags(write=False)
     phase = np.zeros(N_PHASE)
     phase[PHASE_KIND] = IMPACTLESS
     tick(law, memory, 0.0, np.zeros(6), 0.0, phase, 0.0)

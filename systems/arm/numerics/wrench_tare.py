@@ -134,19 +134,19 @@ def tared_mean(law, memory, wrench):
 
 @numba.njit(cache=True)
 def tick(law, memory, wrench, velocity, force_directions):
-    """The memory after one sample.
+    """One sample, which changes the memory in place.
 
     Args: law: TareLaw. memory (N_MEMORY,). wrench (6,) measured, force first [N],
         [N m]. velocity (6,) of the tip [m/s], [rad/s]. force_directions (6,): two rows
         that the tool presses along; zero rows: none. Any of them may be NaN.
     """
-    m = memory.copy()
+    m = memory
     m[_TICKS] += 1.0
     known = m[_TARED] > 0.0
     if not is_usable(wrench, law.wrench_limit):
         m[_STATUS] = BAD_WRENCH
         m[_N] = m[_LONG] = m[_GOOD] = 0.0
-        return m
+        return
     if known:
         m[_STATUS] = TARED
     elif m[_STATUS] == BAD_WRENCH:
@@ -168,7 +168,7 @@ def tick(law, memory, wrench, velocity, force_directions):
     # A sensor that is stuck says nothing of its drift.
     if not free or (known and not changed) or m[_TICKS] * law.period <= SKIP_SEC:
         m[_N] = m[_LONG] = 0.0
-        return m
+        return
     is_long = not known and _add(m, _LONG, wrench, velocity, law.period)
     is_short = _add(m, _N, wrench, velocity, law.period)
     if not (is_short or is_long):
@@ -176,7 +176,7 @@ def tick(law, memory, wrench, velocity, force_directions):
             m[_N] = 0.0
         if m[_LONG] * law.period > WINDOW_MOST_SEC:
             m[_LONG] = 0.0
-        return m
+        return
     first = _N if is_short else _LONG
     seconds, mean = m[first] * law.period, m[first + 1 : first + 7] / m[first]
     m[_N] = m[_LONG] = 0.0
@@ -191,7 +191,6 @@ def tick(law, memory, wrench, velocity, force_directions):
         for i in range(6):
             most = seconds * (law.drift_max if i < 3 else law.drift_moment_max)
             m[_BIAS + i] += min(max(off[i], -most), most)
-    return m
 
 
 @numba.njit(cache=True)
@@ -239,10 +238,10 @@ def _slide(law, m, wrench, velocity, force_directions):
 
 
 def warm_up(law: TareLaw) -> None:
-    """Compiles it, for read-only arrays as a Context's state is."""
+    """Compiles it, for arrays as a Context's: a state that is read is read-only."""
     memory, zero = new_memory(), np.zeros(6)
-    memory.setflags(write=False)
     tick(law, memory, zero, zero, zero)
+    memory.setflags(write=False)
     tared(law, memory, zero)
     tared_mean(law, memory, zero)
     sloped(memory, zero)

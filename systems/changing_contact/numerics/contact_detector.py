@@ -367,15 +367,13 @@ def _is_impact(limits, m, f, total, innovation, speed, learning):
 
 @numba.njit(cache=True)
 def detect(limits, memory, contact, time, wrench, pose, velocity, d, n, phase):
-    """One tick.
+    """One tick, which changes memory and contact in place.
 
     Args: limits: Thresholds. memory (N_MEMORY,), contact (14,): of the last tick.
         time [s]. wrench (6,) on the tool, world axes [N], [N m]. pose (7,) and velocity
         (6,) of the tip. d (3,) unit vector of the motion, zero at rest. n (6,) two rows
         of force directions. phase (6,). Any of them may be NaN.
-    Returns: memory, contact.
     """
-    memory, contact = memory.copy(), contact.copy()
     m = memory.view(MEMORY)[0]
     usable = _is_usable(limits, m, wrench, velocity)
     usable = usable and np.all(np.isfinite(velocity)) and np.all(np.isfinite(pose[:3]))
@@ -385,7 +383,7 @@ def detect(limits, memory, contact, time, wrench, pose, velocity, d, n, phase):
     if not usable:
         _restart(m)
         m.ticks += 1.0
-        return memory, contact
+        return
 
     in_contact = np.sum(n**2) > 0.25
     moving = np.sum(d**2) > 0.25
@@ -503,9 +501,7 @@ def _report(limits, m, contact, d):
 
 
 def warm_up(limits: Thresholds) -> None:
-    """Compiles it, for read-only arrays as a Context's state is."""
+    """Compiles it."""
     memory, contact = new_memory(), np.zeros(N_CONTACT)
-    for state in (memory, contact):
-        state.setflags(write=False)
     zeros = (np.zeros(6), np.zeros(7), np.zeros(6), np.zeros(3), np.zeros(6))
     detect(limits, memory, contact, 0.0, *zeros, np.zeros(6))

@@ -103,18 +103,16 @@ NEAR = 1e-3  # A segment that comes to rest so near to its end has ended [m].
 
 @numba.njit(cache=True)
 def tick(table, law, regions, memory, t, contact, pose):
-    """One tick.
+    """One tick, which changes the memory in place.
 
     Args: table of the pattern; law; regions (N_REGIONS,) as plan gives them; memory of
         the last tick (zeros: none yet); t [s]; contact (14,); pose (7,)
         measured: anything may be NaN.
-    Returns: memory; X, dX/dt, d2X/dt2 (3, 6); tangent (3,), zero at rest; force
+    Returns: X, dX/dt, d2X/dt2 (3, 6); tangent (3,), zero at rest; force
         directions (6,); force targets (2,); phase (6,).
     """
     if memory.view(MEMORY)[0].begun == 0.0:
-        memory = start(table, contact, t, 0.0)
-    else:
-        memory = memory.copy()
+        memory[:] = start(table, contact, t, 0.0)
     m, regions = memory.view(MEMORY)[0], regions.view(REGIONS)[0]
     _absorb_steps(m, t)
     if all_finite(contact):
@@ -154,7 +152,7 @@ def tick(table, law, regions, memory, t, contact, pose):
     phase[PHASE_SEGMENT], phase[PHASE_STAGE], phase[PHASE_KIND] = k, stage, kind
     phase[PHASE_SPEED], phase[PHASE_LENGTH] = v, s
     phase[PHASE_STATUS] = _status(m, regions, bad)
-    return memory, X, tangent, directions, targets, phase
+    return X, tangent, directions, targets, phase
 
 
 @numba.njit(cache=True)
@@ -267,12 +265,12 @@ def plan(table, law, memory, t, contacts):
 
 
 def warm_up(pattern: MotionPattern, law: ShaperLaw) -> None:
-    """Compiles all of it, for arrays as a Context has them: read-only."""
+    """Compiles all of it, for arrays as a Context's: what is only read is read-only."""
     memory, regions = np.zeros(N_MEMORY), np.zeros(N_REGIONS)
     contact, pose = np.zeros(N_CONTACT), np.zeros(7)
-    for array in (memory, regions):
-        array.setflags(write=False)
-    _, X, *_ = tick(pattern.table, law, regions, memory, 0.0, contact, pose)
+    regions.setflags(write=False)
+    X, *_ = tick(pattern.table, law, regions, memory, 0.0, contact, pose)
+    memory.setflags(write=False)
     pose_output(blended(X, X, 0.0, 1.0), pattern.base)
     plan(pattern.table, law, memory, 0.0, np.zeros(0, EXPECTED))
     take_over(pattern.table, law, contact, 0.0, pattern.table, memory)
