@@ -200,8 +200,9 @@ def _rows(sensor: str, diagram: Diagram, context: Context) -> list[dict]:
             "max": 1e3 * float(sec.max()),
         }
         system = diagram.GetSubsystemByName(OUTPUTS[name][0])
-        computing = 1e3 * np.array(getattr(system, "compute_sec", ()))
-        if computing.size:
+        times = getattr(system, "update_times", None)
+        if times is not None:
+            computing = 1e3 * np.array(times.wall_sec)
             row["computing p50"] = float(np.percentile(computing, 50))
             row["computing p99"] = float(np.percentile(computing, 99))
         found.append(row)
