@@ -129,6 +129,7 @@ ARM = """<mujoco model="arm"><option timestep="0.002" integrator="implicitfast"/
 </body></body></body></body></worldbody></mujoco>"""
 
 
+@pytest.mark.slow
 def test_a_torque_constant_that_all_gains_and_masses_could_stand_for_is_named(tmp_path):
     """Of one joint by a tenth: with all masses and the other drives' gains a few per
     cent larger, each within its tolerance, equations agree. Nothing else is named."""

@@ -506,7 +506,9 @@ def test_all_that_joints_may_have_is_no_arm_without_a_drive(tmp_path):
     np.testing.assert_array_equal(beside.prior, n.prior[links])
 
 
-@pytest.mark.parametrize("early", [0.0, 0.005, 0.025])
+@pytest.mark.parametrize(
+    "early", [0.0, pytest.param(0.005, marks=pytest.mark.slow), 0.025]
+)
 def test_commands_that_act_before_their_rows_are_told_whatever_is_hidden(
     tmp_path, early
 ):

@@ -147,7 +147,7 @@ SLOW = pytest.mark.slow
         pytest.param(bench.DRAWER, {"coulomb": 1.0}, marks=SLOW),
         pytest.param(bench.DRAWER, {"coulomb": 4.0}, marks=SLOW),
         # It weighs on the arm all the time.
-        (bench.LID, {"damping": 1.6}),
+        pytest.param(bench.LID, {"damping": 1.6}, marks=SLOW),
         pytest.param(bench.LID, {"mass": 4.0}, marks=SLOW),
         pytest.param(bench.LID, {"mass": 1.0}, marks=SLOW),
         pytest.param(bench.LEG, {"mass": 2.0}, marks=SLOW),

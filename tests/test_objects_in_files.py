@@ -371,7 +371,9 @@ def test_starts_at_random_have_the_covariance_of_all_axes(tmp_path, monkeypatch)
     assert 0.6 < start < 1.6
 
 
-@pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
+@pytest.mark.parametrize(
+    "cone", ["elliptic", pytest.param("pyramidal", marks=pytest.mark.slow)]
+)
 def test_a_right_model_with_contacts_of_mujoco_has_no_gap(tmp_path, cone):
     """And it is said. Friction holds softly there, and has the shape of a pyramid."""
     pushed(tmp_path, 0.9, cone)
@@ -434,6 +436,7 @@ def test_a_ball_of_another_size_is_named_by_windows_of_mujoco(tmp_path):
     assert "mujoco_contacts" in {check.kind for check in result.checks}
 
 
+@pytest.mark.slow
 def test_what_a_legged_robot_carries_is_named_by_windows_of_mujoco(tmp_path):
     """It stands on three legs that slide, of which one is held: a command that stays
     the same is a command."""

@@ -133,7 +133,11 @@ def test_bad_settings_are_one_line_and_status_2(
 
 
 @pytest.mark.parametrize(
-    "module, done", [(multi_spring, "springs"), (porridge, "stirred")]
+    "module, done",
+    [
+        pytest.param(multi_spring, "springs", marks=pytest.mark.slow),
+        (porridge, "stirred"),
+    ],
 )
 def test_reproduce_says_met_only_if_every_seed_ran_and_met(
     tmp_path, monkeypatch, module, done, request
