@@ -71,7 +71,8 @@ def test_a_motors_gain_is_as_it_is_and_as_well_as_the_mass_is_known(tmp_path, fa
     assert std["gain"] == pytest.approx(0.03 * factor, rel=0.05)  # 3 %, of the mass.
 
 
-@pytest.mark.parametrize("factor", [pytest.param(0.88, marks=pytest.mark.slow), 1.15])
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [0.88, 1.15])
 def test_a_gain_and_another_inertia_are_a_tie_of_one_motor(tmp_path, factor):
     scene, log = turned(tmp_path, factor * KT, INERTIA)
     result = run_gap(scene, [log])

@@ -397,7 +397,9 @@ def test_a_case_that_never_ends_is_stopped_and_the_others_are_scored(
     assert scores[0]["says"] == "stopped after 3 s"
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "number", [signal.SIGKILL, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)]
+)
 def test_a_benchmark_that_was_ended_goes_on_where_it_was(number, tmp_path):
     def start(*words):
         return subprocess.Popen(

@@ -353,6 +353,7 @@ def test_a_window_that_takes_the_other_branch_begins_again(off, begins_again):
     assert len(problem.windows) == 3
 
 
+@pytest.mark.slow
 def test_starts_at_random_have_the_covariance_of_all_axes(tmp_path, monkeypatch):
     """With fewer simulations: two for each of them, or for each axis."""
     scene, recordings = pushed(tmp_path, 0.9, "elliptic")
