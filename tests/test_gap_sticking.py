@@ -122,15 +122,6 @@ def recorded(folder, arm, hidden, seed=0, early=0.0):
     return scene, file
 
 
-def problem_of(folder, arm, hidden):
-    scene, file = recorded(folder, arm, hidden)
-    recordings = read_recordings([file])
-    assert is_driven(scene, recordings)
-    problem = DrivenProblem(scene, recordings)
-    problem.learn_misfit()
-    return problem
-
-
 def equations_of(folder, arm, hidden, early=0.0):
     scene, file = recorded(folder, arm, hidden, early=early)
     problem, _ = problem_for(scene, read_recordings([file]), SceneDynamics(scene))
@@ -147,7 +138,12 @@ HIDDEN = {
 
 @pytest.fixture(scope="module")
 def two(tmp_path_factory):
-    return problem_of(tmp_path_factory.mktemp("two"), "two", HIDDEN["two"])
+    scene, file = recorded(tmp_path_factory.mktemp("two"), "two", HIDDEN["two"])
+    recordings = read_recordings([file])
+    assert is_driven(scene, recordings)
+    problem = DrivenProblem(scene, recordings)
+    problem.learn_misfit()
+    return problem
 
 
 def test_the_truth_leaves_the_noise(two):
@@ -280,10 +276,9 @@ def test_what_has_a_state_of_its_own_takes_drakes_steps(tmp_path):
     assert mechanism_measure._compiled(scene, soft) is None
 
 
-def test_rows_are_no_closer_than_a_drive_needs(tmp_path):
-    problem = problem_of(tmp_path, "two", [])
-    assert all(w.rows.step == 1 for w in problem.windows)  # A log of 50 Hz.
-    assert len(problem.base()) == sum(len(w.std) for w in problem.windows) * 2
+def test_rows_are_no_closer_than_a_drive_needs(two):
+    assert all(w.rows.step == 1 for w in two.windows)  # A log of 50 Hz.
+    assert len(two.base()) == sum(len(w.std) for w in two.windows) * 2
 
 
 @pytest.mark.slow
