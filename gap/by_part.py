@@ -140,12 +140,15 @@ def joined(limbs: Sequence[Sequence[str]], results: Sequence[GapResult]) -> GapR
 
 
 def _said_alike(results: Sequence[GapResult]) -> list[GapResult]:
-    """The results, in which what limbs cannot tell apart is what most of them say."""
+    """The results, in which what limbs cannot tell apart is what most of them say, and
+    of what as many say the first."""
     told = Counter((e.kind, e.at) for r in results for e in r.effects)
+    rank = {name: (n, -k) for k, (name, n) in enumerate(told.items())}
 
     def alike(effect: NamedEffect) -> NamedEffect:
         ties = {(t.kind, tuple(t.at)): t for t in effect.indistinguishable_from}
-        most = max([(effect.kind, effect.at), *ties], key=lambda name: told[name])
+        names = [(effect.kind, effect.at), *ties]
+        most = max(names, key=lambda name: rank.get(name, (0, 0)))
         if most not in ties:
             return effect
         instead = ties.pop(most)

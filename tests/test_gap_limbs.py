@@ -229,6 +229,8 @@ def test_what_limbs_cannot_tell_apart_is_what_most_of_them_say():
     assert "cannot distinguish it from sensor_delay" in result.says
     assert (effect.kind, effect.at) == ("input_delay", ("r",))
     assert effect.parameters["delay"].value == pytest.approx(0.032 / 3.0)
+    even = joined(LIMBS, [result_of("ambiguous", [e]) for e in (sure, other)])
+    assert [(e.kind, e.at) for e in even.effects] == [(sure.kind, ("r",))]
     untied = replace(other, indistinguishable_from=())
     each = [result_of("ambiguous", [e]) for e in (untied, sure, sure)]
     assert {e.kind for e in joined(limbs, each).effects} == {
