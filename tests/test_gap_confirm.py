@@ -267,20 +267,25 @@ def test_what_moves_windows_less_than_the_scenes_step_is_not_named(step, kept):
         assert below == np.inf
 
 
-def test_what_others_would_stand_in_for_is_named_however_little_moves_windows():
-    """Two that act on the same rows: without the second the first becomes another."""
-    shown = {"arm.j1": (3.0, 1.0), "arm.j2": (1.2, 1.0), "arm.j3": (1.0, 1.0)}
-    for alike, kept in ((0.0, JOINTS[:1]), (0.5, JOINTS[:2])):
-        problem = Held(shown)
-        more = alike * problem.of[KIND, "arm.j1"]
-        problem.of[KIND, "arm.j2"] = problem.of[KIND, "arm.j2"] + more
-        problem._base += 4.0 * more[:, 0]
-        selection = selection_of(problem, JOINTS[:2])
-        alone = tuple(replace(c, in_group=False) for c in selection.choices)
-        selection = replace(selection, choices=alone)
-        outcome = problem.outcome(selection.effects(), None, None, None)
-        left, *_ = above_step(problem, selection, outcome, 5.0, 1)
-        assert tuple(c.effect.at[0] for c in left.choices) == kept
+@pytest.mark.parametrize(("alone", "kept"), [(1.02, []), (9.0, JOINTS[:1])])
+def test_what_others_stand_in_for_is_named_where_it_moves_windows(alone, kept):
+    """An encoder's zero, in whose place links within their tolerance leave as little:
+    with all else as it was fitted windows are far off without it."""
+
+    class StoodIn(Held):
+        def outcome(self, effects, start, end, nuisances, recordings=None, jobs=1):
+            there, fitted = (len(list(x)) for x in (effects, end.effects))
+            after = alone if there < fitted else 1.0
+            return Outcome(GapMeasure(9.0, after, 1.0, 0.3))
+
+    problem = StoodIn({"arm.j1": (9.0, 1.0)})
+    selection = selection_of(problem, JOINTS[:1])
+    selection = replace(
+        selection, choices=(replace(selection.choices[0], in_group=False),)
+    )
+    outcome = problem.outcome(selection.effects(), None, selection.end, None)
+    left, *_ = above_step(problem, selection, outcome, 3.0, 1)
+    assert [c.effect.at[0] for c in left.choices] == [*kept]
 
 
 def test_nothing_is_simulated_for_the_step_where_no_window_was_measured(monkeypatch):

@@ -29,8 +29,6 @@ from makebreak.gap.thresholds import (
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
 
-# Deviations, and share of itself, by which a parameter is another one.
-SURE_STD, OTHER_BY = 3.0, 0.1
 MOST_STD = 0.5  # Of a stiffness, as a share of it.
 # Another selection in the place of one; None: there is none.
 Other = Callable[[Selection], Selection | None]
@@ -173,19 +171,6 @@ def _fit(
     return fit if all(map(is_sane, fit.effects)) else None
 
 
-def _others_move(fit: Fitted, fewer: Fitted) -> bool:
-    """Whether effects become others in a fit with fewer of them, by what is known."""
-    told = {(e.kind, tuple(e.at)): (e.parameters, std)
-            for e, std in zip(fit.effects, fit.std, strict=True)}  # fmt: skip
-    for effect in fewer.effects:
-        was, std = told[effect.kind, tuple(effect.at)]
-        for name, value in effect.parameters.items():
-            by = max(SURE_STD * std.get(name, np.inf), OTHER_BY * abs(was[name]))
-            if abs(value - was[name]) > by:
-                return True
-    return False
-
-
 def above_step(
     problem: GapProblem,
     selection: Selection,
@@ -195,8 +180,10 @@ def above_step(
 ) -> tuple[Selection, Outcome | None, list[tuple[Choice, str]], float]:
     """The selection without effects that move simulated windows, which agree without
     them, less than the scene's own time step does, all together: the world may have
-    such a step, too, or none. Not those in whose place others would be others. And what
-    it comes to; those effects, and why; the held-out error with them.
+    such a step, too, or none. What an effect moves is asked with all else as it was
+    fitted: masses within their tolerance stand in for an encoder's zero, and a step
+    does not. And what it comes to; those effects, and why; the held-out error with
+    them.
 
     Args: step: what the scene's time step errs by, in windows' expected errors.
     """
@@ -205,15 +192,21 @@ def above_step(
     for unit in reversed(units_of(selection.choices)) if step > 0.0 else ():
         if first is None or not first.gap.is_measured:
             break
-        fewer = without(problem, selection, *[choice.effect for choice in unit])
-        other = problem.outcome(
-            fewer.effects(), fewer.start, fewer.end, fewer.nuisances, jobs=jobs
+        gone = [choice.effect for choice in unit]
+        fewer = without(problem, selection, *gone)
+        names = {(e.kind, tuple(e.at)) for e in gone}  # Fits change the parameters.
+        rest = [e for e in selection.effects() if (e.kind, tuple(e.at)) not in names]
+        there = [(rest, selection), (fewer.effects(), fewer)]
+        found = [
+            problem.outcome(effects, some.start, some.end, some.nuisances, jobs=jobs)
+            for effects, some in there
+        ]
+        alone, other = (
+            x if x is not None and x.gap.is_measured else None for x in found
         )
-        if other is None or not other.gap.is_measured:
+        if alone is None or other is None:
             break
-        if _others_move(selection.end, fewer.end):
-            continue
-        moved = abs(other.gap.after**2 - first.gap.after**2) ** 0.5
+        moved = abs(alone.gap.after**2 - first.gap.after**2) ** 0.5
         if other.gap.after <= AGREEMENT_RMS_MAX and moved <= step:
             why = (
                 "It moves simulated windows, with what else moves them as little, by "
