@@ -230,6 +230,10 @@ def test_what_the_file_gives_no_drive_has_none(tmp_path, suffix, passive, driven
         assert said == (of_puck == passive)
 
 
+WALL = """<link name="wall"/><joint name="hook" type="fixed"><parent link="wall"/>
+<child link="base"/><origin xyz="0 0 0" rpy="{0}"/></joint><link name="base"/>"""
+
+
 def judged(folder, change, robot="three"):
     """What is said of a log whose columns and times `change` alters in place."""
     path, log = exact(robot, folder, np.random.default_rng(4))
@@ -283,6 +287,27 @@ def test_efforts_of_another_motion_are_said_to_explain_nothing(tmp_path):
 
     assert "in its joints' order" in judged(tmp_path, other)["effort_unexplained"]
     assert judged(tmp_path, lambda columns: None) == {}
+
+
+def test_a_base_that_hangs_on_a_wall_is_told_by_the_efforts(tmp_path):
+    """In a log without an IMU, whose efforts do not go with the motion of a base that
+    stands."""
+    path, log = exact("six", tmp_path, np.random.default_rng(4))
+    text = path.read_text()
+    columns = {"time": log.time} | log.columns
+    q = np.stack([log.truth[f"arm.joint{k}.position"] for k in range(1, 7)], axis=1)
+    for sign, turn in ((-1.0, "0 0 0"), (1.0, "0 1.5708 0")):
+        path.write_text(text.replace('<link name="base"/>', WALL.format(turn)))
+        at_rest = needed_efforts(read_robot(path).plant, q, 0.0 * q, 0.0 * q)
+        for k in range(6):
+            name = f"joint{k + 1}_effort"
+            columns[name] = columns[name] + sign * at_rest[:, k]
+    path.write_text(text)
+    file = csv(tmp_path / "log.csv", columns)
+    proposal = propose_scene(read_robot(path), [read_log(file)])
+    assert [each.kind for each in proposal.said] == ["base_tilted"]
+    gravity = yaml.safe_load(proposal.scene)["plant"]["gravity"]
+    np.testing.assert_allclose(gravity, [9.81, 0.0, 0.0], atol=0.3)
 
 
 def test_a_robot_without_masses_is_refused_by_its_joints(tmp_path):

@@ -20,6 +20,7 @@ from itertools import combinations, permutations
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import JacobianWrtVariable
 from scipy.optimize import linear_sum_assignment, minimize_scalar, nnls
 
 from makebreak.gap.data.findings import Finding
@@ -43,6 +44,7 @@ TOLD_WELL = 0.01  # Of what is predicted: no other unit can tell it much better.
 LEAST_LEFT = 1e-5  # Less is rounding.
 GIVES_WAY = 0.05  # [rad], [m]
 LEAST_TOLD = 0.3  # Of a column that is not noise, to judge it without that.
+WELL_HUNG = 0.25  # Of efforts, left by gravity of another direction and friction.
 PARTS = 5  # Of the data: a factor scatters over them.
 KNOWN_TO = 0.1  # Of a factor, 1 sigma.
 # Factors of one robot differ by less than this share, or by so many sigmas.
@@ -279,6 +281,32 @@ class Contents:
             out[k] = -self._plant.CalcGravityGeneralizedForces(context)
         return out
 
+    def gravity(self, efforts: Mapping[int, str]) -> tuple[np.ndarray, float]:
+        """(3,) gravity [m/s2] in world with which the efforts go with the motion best,
+        beside friction; and the share of them that it leaves."""
+        plant, world = self._plant, self._plant.world_frame()
+        context, n = plant.CreateDefaultContext(), len(self.joints)
+        J, mass = np.zeros((len(self.q), 3, n)), plant.CalcTotalMass(context)
+        for k, q in enumerate(self.q if mass > 0.0 else ()):
+            plant.SetPositions(context, q)
+            J[k] = plant.CalcJacobianCenterOfMassTranslationalVelocity(
+                context, JacobianWrtVariable.kV, world, world
+            )
+        own = -mass * J
+        moved, A, b = self.needed - self.weight(), [], []
+        for i, name in efforts.items():
+            if (y := self.column(name)) is None or not np.ptp(y) > 0.0:
+                continue
+            rubs = np.zeros((len(y), 2 * n))
+            rubs[:, i], rubs[:, n + i] = self.v[:, i], np.sign(self.v[:, i])
+            A.append(np.hstack([own[:, :, i], rubs]) / np.std(y))
+            b.append((y - moved[:, i]) / np.std(y))
+        if not A:
+            return np.zeros(3), 1.0
+        X, y = np.vstack(A), np.concatenate(b)
+        c = np.linalg.lstsq(X, y, rcond=None)[0]
+        return c[:3], float(np.sum((y - X @ c) ** 2) / np.sum(y**2))
+
     def fewer(self, m: int) -> "Contents":
         """At about m instants."""
         k = max(len(self.q) // m, 1)
@@ -392,6 +420,27 @@ def by_content(
     _late(contents, matches, said)
     _from_a_start(contents, matches, said)
     return matches, said
+
+
+def turned_gravity(
+    plant: MultibodyPlant,
+    joints: Sequence[JointName],
+    columns: Mapping[str, np.ndarray],
+    matches: Sequence[Match],
+) -> np.ndarray | None:
+    """(3,) gravity [m/s2] in world with which the efforts go with the motion, as where
+    the base hangs from a wall; None where none does."""
+    try:
+        contents = Contents(plant, joints, columns, matches)
+    except ValueError:
+        return None
+    efforts = _columns_of(contents, matches, _DRIVES)
+    g, rest = contents.gravity(efforts)
+    off = abs(float(np.linalg.norm(g)) / 9.81 - 1.0)
+    left = [contents.told(name, i).left for i, name in efforts.items()]
+    much = max(1.0 - EXPLAINS, CLEARER * rest)
+    clear = off < KNOWN_TO and rest < WELL_HUNG and np.median(left or [0.0]) > much
+    return g if clear else None
 
 
 # ----- What has no content

@@ -29,6 +29,7 @@ from makebreak.gap.data.content import (
     by_content,
     left_by,
     told_by,
+    turned_gravity,
 )
 from makebreak.gap.data.coordinates import by_lists
 from makebreak.gap.data.findings import (
@@ -161,10 +162,13 @@ def _load(
     path: Path,
     welded: Mapping[str, RigidTransform] | None = None,
     fixed: Mapping[str, float] | None = None,
+    gravity: tuple[float, ...] | None = None,
 ) -> MultibodyPlant:
     """welded: {body: its pose in world}; fixed: {joint, without the model's name: where
-    it stands}."""
+    it stands}; gravity [m/s2]: in place of the file's."""
     file = without_lost_collisions(path, given_packages())
+    if gravity is not None:
+        file = replace(file, gravity=gravity)
 
     def of(text: str) -> MultibodyPlant:
         return _plant(path, file, text, welded or {}, fixed)
@@ -462,9 +466,14 @@ def judge_logs(robot: Robot, logs: Sequence[Log]) -> Judged:
         robot = _with_fixed(robot, fixed)
         every = {path: _left_out(matches, fixed) for path, matches in every.items()}
     for log in logs if robot.joints else ():
-        matches, more = by_content(
-            robot.plant, robot.joints, log.table.columns, every[log.path]
-        )
+        columns, named = log.table.columns, every[log.path]
+        matches, more = by_content(robot.plant, robot.joints, columns, named)
+        others = {each.kind for each in more} - {UNEXPLAINED, FROM_A_START}
+        if not others and not robot.poses:  # Nothing else says why.
+            g = turned_gravity(robot.plant, robot.joints, columns, named)
+            if g is not None:
+                robot = _hung(robot, g, fixed, said)
+                matches, more = by_content(robot.plant, robot.joints, columns, named)
         every[log.path] = matches
         # What objects push back with is in the efforts, and not in the model's motion.
         said += [
@@ -485,6 +494,20 @@ def judge_logs(robot: Robot, logs: Sequence[Log]) -> Judged:
     return Judged(
         robot, every, fixed, tuple(unused), tuple(said), servos, in_lines, most
     )
+
+
+def _hung(robot: Robot, g: np.ndarray, fixed, said: list[Said]) -> Robot:
+    """With gravity g [m/s2] as the efforts have it, where its base hangs."""
+    gravity = tuple(float(f"{x:.4g}") for x in g)
+    says = (
+        "The efforts do not go with the motion of a base that stands as the file has "
+        f"it, and do with gravity of ({', '.join(f'{x:.3g}' for x in g)}) m/s2: the "
+        "base hangs or is tilted. The proposed scene has that gravity."
+    )
+    said.append(Said("base_tilted", robot.joints[0].name, 9.81, says))
+    names = {name.partition(".")[2]: q for name, q in fixed.items()}
+    plant = _load(robot.path, _poses(robot), names, gravity)
+    return replace(robot, file=replace(robot.file, gravity=gravity), plant=plant)
 
 
 def _servos_of_efforts(
