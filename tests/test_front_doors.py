@@ -556,6 +556,26 @@ def test_friction_tells_the_sign_of_an_effort_that_carries_nothing(tmp_path):
         )
 
 
+@pytest.mark.parametrize("first", [1.0, -1.0])
+def test_efforts_of_joints_that_do_not_tell_have_the_sign_of_those_that_do(
+    tmp_path, first
+):
+    """As a KUKA's, all of whose efforts have the other sign. Two joints tell it, each
+    with a gain of its own; where these differ the third is left."""
+    path, log = exact("three", tmp_path, np.random.default_rng(4))
+    columns = {"time": log.time} | log.columns
+    slow = np.cumsum(np.random.default_rng(1).normal(size=len(log.time)))
+    drift = slow / np.std(slow) * 10.0 * np.std(columns["joint3_effort"])
+    columns["joint3_effort"] = -(columns["joint3_effort"] + drift)
+    columns["joint1_effort"] = -0.8 * first * columns["joint1_effort"]
+    columns["joint2_effort"] = -1.3 * columns["joint2_effort"]
+    read = read_log(csv(tmp_path / "log.csv", columns))
+    text = propose_scene(read_robot(path), [read]).sidecars[read.path]
+    for k, turned in ((1, first > 0.0), (2, True), (3, first > 0.0)):
+        line = f"joint{k}_effort: {{channel: arm.joint{k}.effort_measured, scale: -1"
+        assert (line in text) == turned
+
+
 def test_efforts_are_in_the_unit_that_most_of_them_are_in(tmp_path):
     """One joint gives 12 % more than its model needs: a gain, for the search to find,
     and no unit of its own."""

@@ -1091,6 +1091,8 @@ def _factors(
     elif not alike:
         odd = {i: f for i, f in odd.items()
                if f < 0.0 or not 1.0 / LARGE < f < LARGER}  # fmt: skip
+    if len(every) > 1 and all(x.factor < 0.0 for x in every.values()):
+        odd = dict.fromkeys(found, -1.0) | odd  # One convention has all their signs.
     if alike:  # Of joints that do not tell, as of those that do.
         odd = dict.fromkeys(found, middle)
     out = {i: (1.0, _UNSURE) for i, x in known.items() if x.factor < GAINS[0]}
