@@ -275,11 +275,6 @@ class GapProblem(ABC):
     def candidates(self, nuisances: Nuisances, current: Fitted) -> Sequence[Candidate]:
         """Every effect that could be added to what is there."""
 
-    def next_candidates(self, current: Fitted) -> Sequence[Candidate]:
-        """Those beside what is there now whose columns another effect changes, and that
-        take little time; none where columns are the same whatever else is there."""
-        return ()
-
     @abstractmethod
     def where(self, left: np.ndarray) -> list[Where]:
         """Where residuals (m,) stand out."""

@@ -86,10 +86,6 @@ PAIR_RIVALS_MAX = 3
 
 # Candidates all pairs of which are tried against the best single effect.
 PAIR_CANDIDATES = 10
-# Looking ahead: how many first effects, besides the best, and how many second effects
-# for each are fitted exactly.
-LOOKAHEAD_FIRST = 4
-LOOKAHEAD_SECOND = 2
 
 # ----- Nuisances
 

@@ -215,7 +215,7 @@ def test_a_wall_stands_where_what_is_pushed_meets_it(tmp_path):
     search = Comparison(problem, lambda text: None)
     start = fit_effects(problem, search.screen(problem.base()), ())
     [wall] = [
-        c for c in problem.next_candidates(start)
+        c for c in problem.candidates(search.nuisances, start)
         if (c.kind, c.at) == ("wall_position", ("north.north",))
     ]  # fmt: skip
     [ranked] = rank(search.screen(start.r), [wall])

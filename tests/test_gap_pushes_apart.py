@@ -281,92 +281,10 @@ def test_a_friction_far_off_is_guessed_by_steps_as_far(tmp_path, factor):
     truth = replace(world, tip_friction=factor * world.tip_friction)
     problem = pushed_problem(tmp_path, world, truth, rng, 5)
     screen = screen_of(problem)
-    found = problem.next_candidates(fit_effects(problem, screen, []))
+    found = problem.candidates(problem.nuisances(), fit_effects(problem, screen, []))
     (one,) = [r for r in rank(screen, found) if r.candidate.at == (f"{BLOCK}~tip.tip",)]
     guess = one.effects[0].parameters["friction"]
     assert guess == pytest.approx(truth.tip_friction, rel=0.15)
-
-
-class OneHidesTheOther(TwoAtOnce):
-    """Of two frictions the second shows only where the first is right, as that of a tip
-    on a block whose own friction is wrong; a mass with a patch's five parameters does
-    more than the first."""
-
-    plan = SearchPlan(least_gain=0.05, most_effects=1)
-    FIRST, SECOND = "a.a~table.table", "a.a~tip.tip"
-
-    def __init__(self, looks_ahead: bool, alike: bool = False, size: int = 4):
-        """Args: alike: the drag does what both frictions do; size: how many parameters
-        it has."""
-        super().__init__()
-        self._ahead, self._size = looks_ahead, size
-        one, two, other, rest = np.random.default_rng(9).normal(
-            size=(4, len(self._base))
-        )
-        self._one, self._two = 30.0 * one, 30.0 * two
-        self._like = self._one + 0.8 * self._two + 30.0 * other
-        if alike:
-            # Something is left by either: below the noise no second is looked for.
-            self._like, rest = self._effect(0.2, 0.2), 6.0 * rest
-        self._base = rest + self._effect(0.2, 0.2)
-
-    def _effect(self, first: float, second: float) -> np.ndarray:
-        return first * self._one + 5.0 * first * second * self._two
-
-    def residual(self, effects=()):
-        friction = {self.FIRST: 0.0, self.SECOND: 0.0}
-        like = 0.0
-        for e in effects:
-            if e.kind == "contact_friction":
-                friction[e.at[0]] = e.parameters["friction"]
-            else:
-                like += e.parameters["coefficient"]
-        return self._base - self._effect(*friction.values()) - like * self._like
-
-    def _all(self, there):
-        now = self.residual(there)
-        friction = [
-            Candidate(
-                "contact_friction", (at,), 1,
-                ((now - self.residual([*there, Effect("contact_friction", [at], {
-                    "friction": 0.1})]))[:, None] / 0.1,),
-                (lambda c: {"friction": float(c[0])},),
-            )
-            for at in (self.FIRST, self.SECOND)
-            if all(at not in e.at for e in there)
-        ]  # fmt: skip
-        like = Candidate(
-            "joint_quadratic_drag", ("a.j",), self._size, (self._like[:, None],),
-            (lambda c: {"coefficient": float(c[0])},),
-        )  # fmt: skip
-        return [c for c in [*friction, like] if np.abs(c.columns[0]).max() > 0.0]
-
-    def candidates(self, nuisances, current):
-        return self._all(list(current.effects))
-
-    def next_candidates(self, current):
-        return self.candidates(None, current) if self._ahead else ()
-
-
-def test_two_effects_of_which_one_hides_the_other_are_looked_for_ahead():
-    ahead, greedy = (select(OneHidesTheOther(x)).choices for x in (True, False))
-    assert greedy[0].effect.kind == "joint_quadratic_drag"
-    assert [(c.effect.kind, c.effect.at) for c in ahead] == [
-        ("contact_friction", [OneHidesTheOther.FIRST]),
-        ("contact_friction", [OneHidesTheOther.SECOND]),
-    ]
-    for c in ahead:
-        assert c.effect.parameters["friction"] == pytest.approx(0.2, abs=0.002)
-        assert c.ties == ()
-
-
-@pytest.mark.parametrize(("size", "kinds"), [
-    (2, ["joint_quadratic_drag"]), (4, 2 * ["contact_friction"]),
-])  # fmt: skip
-def test_two_effects_that_leave_as_much_need_fewer_parameters(size, kinds):
-    """Than the single one, whose place they would take."""
-    found = select(OneHidesTheOther(True, alike=True, size=size)).choices
-    assert [c.effect.kind for c in found] == kinds
 
 
 def test_a_body_that_drake_cannot_scale_has_no_size_to_name(tmp_path):

@@ -65,9 +65,6 @@ class ContactCandidates(ContactRows):
             found += self._patches(pair, current)
         return found
 
-    def next_candidates(self, current: Fitted) -> list[Candidate]:
-        return self._plain_candidates(current.r, current.effects)
-
     def _plain_candidates(self, r: np.ndarray, there: Sequence[Effect]):
         """All but patches, each by the difference that a trial makes."""
         found: list[Candidate] = []

@@ -433,9 +433,6 @@ class PressingProblem(FeltPlaces):
                 found += self._patches(pair, current)
         return found
 
-    def next_candidates(self, current: Fitted) -> list[Candidate]:
-        return self._whole_candidates(current)[0]
-
     def _whole_candidates(self, current: Fitted) -> tuple[list[Candidate], bool]:
         """Candidates but patches, and whether a place or the friction of a body takes
         off a tenth of what is left. Then a softer contact is none: it lets a tool stay

@@ -21,7 +21,7 @@ from makebreak.gap.search.groups import (
     of_more_kinds,
     with_pruned_groups,
 )
-from makebreak.gap.search.pairs import look_ahead, pair_instead
+from makebreak.gap.search.pairs import pair_instead
 from makebreak.gap.search.rivals import Rivals
 from makebreak.gap.search.screen import Ranked, rank
 from makebreak.gap.search.trials import (
@@ -191,10 +191,7 @@ def _pair(
     if both is not None:
         for trial in fit_each(search, screen, chosen, [both]):
             return trial
-    pair = pair_instead(search, wide, screen, chosen, ranked, trials[pick])
-    if pair is None:
-        pair = look_ahead(search, screen, chosen, trials, pick)
-    return pair
+    return pair_instead(search, wide, screen, chosen, ranked, trials[pick])
 
 
 def _wider(

@@ -116,12 +116,6 @@ def places(chosen: Sequence[Choice]) -> set[tuple[str, tuple[str, ...]]]:
     return {(c.effect.kind, tuple(c.effect.at)) for c in chosen}
 
 
-def on_trial(ranked: Ranked, effect: Effect) -> Choice:
-    """An effect that is tried, in the form of a choice; its errors are not known."""
-    of = ranked.candidate
-    return Choice(effect, {}, np.inf, np.inf, "", np.inf, (), of.fixed, of.size)
-
-
 def pair_of(a: Ranked, b: Ranked, effects: Sequence[Effect]) -> Ranked:
     """Two candidates that are added at once, as these effects."""
     one, two = a.candidate, b.candidate
