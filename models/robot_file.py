@@ -460,8 +460,8 @@ def _without_undefined(document: minidom.Document) -> list[str]:
 
 def _as_gazebo_reads(document: minidom.Document) -> list[str]:
     """An SDF without what Gazebo or PyBullet do not mind and Drake stops at: joints
-    with a link's name, materials, a link as the frame of its own inertia, and an empty
-    link called world, which is the world."""
+    with a link's name, scripts of materials, a link as the frame of its own inertia, and an
+    empty link called world, which is the world."""
     notes = []
     for link in document.getElementsByTagName("link"):
         if link.getAttribute("name") == "world" and not children(link, "inertial"):
@@ -476,9 +476,9 @@ def _as_gazebo_reads(document: minidom.Document) -> list[str]:
         for pose in children(inertial, "pose"):
             if pose.getAttribute("relative_to") == own.getAttribute("name"):
                 pose.removeAttribute("relative_to")
-    for visual in document.getElementsByTagName("visual"):
-        for material in children(visual, "material"):
-            _remove(material)
+    for material in document.getElementsByTagName("material"):
+        for script in children(material, "script"):  # Gazebo's; colours stay.
+            _remove(script)
     return notes
 
 

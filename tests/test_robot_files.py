@@ -111,18 +111,20 @@ def test_a_package_elsewhere_in_a_workspace_is_found(tmp_path):
 
 
 def test_an_sdf_as_gazebo_reads_it_is_read(tmp_path):
-    """A joint with a link's name, a link as the frame of its own inertia, a material
-    without a file, and a limit that is not where SDF has it."""
+    """A joint with a link's name, a link as the frame of its own inertia, a script of a
+    material beside its colour, and a limit that is not where SDF has it."""
     path = tmp_path / "wheel.sdf"
     path.write_text("""<sdf version="1.7"><model name="w"><link name="base"/>
 <link name="wheel"><inertial><pose relative_to="wheel">0 0 0.1 0 0 0</pose><mass>2
 </mass></inertial><visual name="v"><geometry><sphere><radius>1</radius></sphere>
-</geometry><material><script><name>Red</name></script></material></visual></link><joint
+</geometry><material><script><name>Red</name></script><diffuse>1 0 0 1</diffuse>
+</material></visual></link><joint
 name="wheel" type="revolute"><parent>base</parent><child>wheel</child><axis><xyz>0 0 1
 </xyz><lower>-1</lower></axis></joint></model></sdf>""")
     own = read_robot(path)
     assert [j.name for j in own.joints] == ["w.wheel_joint"]
     assert own.plant.GetBodyByName("wheel").default_mass() == 2.0
+    assert "<diffuse>" in own.file.text and "script" not in own.file.text
     assert own.file.notes == (
         "joint wheel has a link's name: it is called wheel_joint",
         "<lower> of <axis>: no words of SDF, which are left out",
