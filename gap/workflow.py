@@ -714,7 +714,8 @@ def conclude(
     """
     selection = _beyond_laws(problem, selection)
     selection, chosen_on = chosen_by_simulation(problem, selection, jobs)
-    step = max((c.size for c in checks if c.kind == "time_step"), default=0.0)
+    steps = [c for c in checks if c.kind == "time_step"]
+    step = dict(max(steps, key=lambda c: c.size).of) if steps else {}
     selection, chosen_on, vetoed, below = above_step(
         problem, selection, chosen_on, step, jobs
     )
@@ -1074,13 +1075,16 @@ def _settle_step(
         for x, y, w in zip(a, b, coarse_model.windows, strict=True)
         if len(x)
     ]
-    apart = np.clip(np.concatenate(off), -200, 200) if off else np.full(1, np.nan)
+    apart = np.clip(np.concatenate(off), -200, 200) if off else np.full((1, 1), np.nan)
     if not np.isfinite(apart).any():  # No window can be simulated with one of them.
         return scene, []
     size = float(np.sqrt(np.nanmean(apart**2)))
     if size < 1.0 and not is_mechanism:
         return scene, []  # A finer step costs four times as much.
     grave = size >= 0.3
+    told = np.isfinite(apart).any(axis=0)
+    each = np.sqrt(np.nanmean(apart[:, told] ** 2, axis=0))
+    names = [name for name, t in zip(coarse_model.channels, told, strict=True) if t]
     return fine, [
         Finding(
             "time_step",
@@ -1092,6 +1096,7 @@ def _settle_step(
             f"The scene's time step of {step:g} s errs by {figure(size, 2)} times the "
             f"noise within {WINDOW_SEC} s; the comparison uses "
             f"{fine.plant.time_step or 'a continuous plant'}.",
+            tuple(zip(names, map(float, each), strict=True)),
         )
     ]
 

@@ -460,8 +460,8 @@ def _without_undefined(document: minidom.Document) -> list[str]:
 
 def _as_gazebo_reads(document: minidom.Document) -> list[str]:
     """An SDF without what Gazebo or PyBullet do not mind and Drake stops at: joints
-    with a link's name, scripts of materials, a link as the frame of its own inertia, and an
-    empty link called world, which is the world."""
+    with a link's name, scripts of materials, a link as the frame of its own inertia,
+    and an empty link called world, which is the world."""
     notes = []
     for link in document.getElementsByTagName("link"):
         if link.getAttribute("name") == "world" and not children(link, "inertial"):

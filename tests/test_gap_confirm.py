@@ -237,17 +237,19 @@ def test_half_of_the_gap_must_be_closed_in_simulation_and_in_equations(
 @pytest.mark.parametrize(
     ("step", "kept"),
     [
-        (0.0, JOINTS),  # A continuous plant errs by nothing.
-        # Windows of three joints: sqrt((1.2^2 - 1) / 3) = 0.38 for the second one, and
-        # 0.29 for the third, 0.48 for both; without the first one they are 1.9 times
-        # off.
-        (0.2, JOINTS),
-        (0.45, JOINTS[:2]),
-        (5.0, JOINTS[:1]),
+        ({}, JOINTS),  # A continuous plant errs by nothing.
+        # Windows of the joint itself: sqrt(1.2^2 - 1) = 0.66 for the second one, and
+        # 0.50 for the third; without the first one they are 1.9 times off.
+        (dict.fromkeys(JOINTS, 0.4), JOINTS),
+        (dict.fromkeys(JOINTS, 0.6), JOINTS[:2]),
+        (dict.fromkeys(JOINTS, 5.0), JOINTS[:1]),
+        # What it errs by at other joints says nothing of these.
+        ({"arm.j1": 5.0}, JOINTS),
     ],
 )
 def test_what_moves_windows_less_than_the_scenes_step_is_not_named(step, kept):
     problem = Held({"arm.j1": (3.0, 1.0), "arm.j2": (1.2, 1.0), "arm.j3": (1.12, 1.0)})
+    step = {f"{joint}.position": by for joint, by in step.items()}
     selection = selection_of(problem)
     outcome = problem.outcome(selection.effects(), None, None, None)
     # A group is one: without it windows are off.
@@ -276,7 +278,8 @@ def test_what_others_stand_in_for_is_named_where_it_moves_windows(alone, kept):
         def outcome(self, effects, start, end, nuisances, recordings=None, jobs=1):
             there, fitted = (len(list(x)) for x in (effects, end.effects))
             after = alone if there < fitted else 1.0
-            return Outcome(GapMeasure(9.0, after, 1.0, 0.3))
+            per = {"arm.j1.position": {"before": 9.0, "after": after}}
+            return Outcome(GapMeasure(9.0, after, 1.0, 0.3, per))
 
     problem = StoodIn({"arm.j1": (9.0, 1.0)})
     selection = selection_of(problem, JOINTS[:1])
@@ -284,7 +287,7 @@ def test_what_others_stand_in_for_is_named_where_it_moves_windows(alone, kept):
         selection, choices=(replace(selection.choices[0], in_group=False),)
     )
     outcome = problem.outcome(selection.effects(), None, selection.end, None)
-    left, *_ = above_step(problem, selection, outcome, 3.0, 1)
+    left, *_ = above_step(problem, selection, outcome, {"arm.j1.position": 3.0}, 1)
     assert [c.effect.at[0] for c in left.choices] == [*kept]
 
 
@@ -294,7 +297,9 @@ def test_nothing_is_simulated_for_the_step_where_no_window_was_measured(monkeypa
     nothing = Outcome(GapMeasure(np.nan, np.nan, 1.0, 0.0))
     assert not nothing.gap.is_measured
     monkeypatch.setattr(problem, "outcome", lambda *_, **__: pytest.fail("simulated"))
-    left, after, small, _ = above_step(problem, selection, nothing, 5.0, 1)
+    left, after, small, _ = above_step(
+        problem, selection, nothing, {"arm.j1.position": 5.0}, 1
+    )
     assert left is selection and after is nothing and not small
 
 

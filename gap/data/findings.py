@@ -31,6 +31,7 @@ class Finding:
     unit: str
     severity: str
     says: str  # One English sentence.
+    of: tuple[tuple[str, float], ...] = ()  # (channel, its size), where it has many.
 
 
 @dataclass(frozen=True)

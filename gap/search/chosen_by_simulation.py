@@ -4,7 +4,7 @@ Equations of motion approximate some effects, and a law that is written down oth
 makes them prefer another; simulation decides between the few that are left.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 
@@ -175,21 +175,21 @@ def above_step(
     problem: GapProblem,
     selection: Selection,
     outcome: Outcome | None,
-    step: float,
+    step: Mapping[str, float],
     jobs: int,
 ) -> tuple[Selection, Outcome | None, list[tuple[Choice, str]], float]:
     """The selection without effects that move simulated windows, which agree without
-    them, less than the scene's own time step does, all together: the world may have
-    such a step, too, or none. What an effect moves is asked with all else as it was
-    fitted: masses within their tolerance stand in for an encoder's zero, and a step
-    does not. And what it comes to; those effects, and why; the held-out error with
-    them.
+    them, less than the scene's own time step does, all together, where they move them
+    most: the world may have such a step, too, or none. What an effect moves is asked
+    with all else as it was fitted: masses within their tolerance stand in for an
+    encoder's zero, and a step does not. And what it comes to; those effects, and why;
+    the held-out error with them.
 
-    Args: step: what the scene's time step errs by, in windows' expected errors.
+    Args: step: {channel: what the scene's time step errs by, in expected errors}.
     """
     small: list[tuple[Choice, str]] = []
     below, first = problem.error(selection.end), outcome
-    for unit in reversed(units_of(selection.choices)) if step > 0.0 else ():
+    for unit in reversed(units_of(selection.choices)) if step else ():
         if first is None or not first.gap.is_measured:
             break
         gone = [choice.effect for choice in unit]
@@ -206,12 +206,17 @@ def above_step(
         )
         if alone is None or other is None:
             break
-        moved = abs(alone.gap.after**2 - first.gap.after**2) ** 0.5
-        if other.gap.after <= AGREEMENT_RMS_MAX and moved <= step:
+        moved = {
+            name: abs(each["after"] ** 2 - first.gap.per_channel[name]["after"] ** 2)
+            for name, each in alone.gap.per_channel.items()
+        }
+        most = max(moved, key=lambda name: moved[name], default="")
+        by, errs = moved.get(most, np.inf) ** 0.5, step.get(most, 0.0)
+        if other.gap.after <= AGREEMENT_RMS_MAX and by <= errs:
             why = (
                 "It moves simulated windows, with what else moves them as little, by "
-                f"{moved:.2g} times the expected error, no more than the scene's time "
-                f"step errs by ({step:.2g})."
+                f"{by:.2g} times the expected error at {most}, no more than the "
+                f"scene's time step errs by there ({errs:.2g})."
             )
             small += [(choice, why) for choice in unit]
             selection, outcome = fewer, other
