@@ -291,6 +291,15 @@ def test_what_others_stand_in_for_is_named_where_it_moves_windows(alone, kept):
     assert [c.effect.at[0] for c in left.choices] == [*kept]
 
 
+def test_where_no_window_can_be_simulated_with_an_effect_the_step_says_nothing():
+    problem = Held({"arm.j1": (3.0, 1.0)})
+    selection = selection_of(problem, JOINTS[:1])
+    nothing = Outcome(GapMeasure(3.0, 1.0, 1.0, 0.3))
+    step = {"arm.j1.position": 5.0}
+    left, after, small, _ = above_step(problem, selection, nothing, step, 1)
+    assert left is selection and after is nothing and not small
+
+
 def test_nothing_is_simulated_for_the_step_where_no_window_was_measured(monkeypatch):
     problem = Held({"arm.j1": (3.0, 1.0)})
     selection = selection_of(problem)

@@ -206,10 +206,14 @@ def above_step(
         )
         if alone is None or other is None:
             break
+        with_it, without_it = (
+            {name: each["after"] for name, each in found.gap.per_channel.items()}
+            for found in (first, alone)
+        )
         moved = {
-            name: abs(each["after"] ** 2 - first.gap.per_channel[name]["after"] ** 2)
-            for name, each in alone.gap.per_channel.items()
-        }
+            name: abs(x**2 - with_it[name] ** 2) for name, x in without_it.items()
+            if np.isfinite(x + with_it.get(name, np.nan))  # Some fail with effects.
+        }  # fmt: skip
         most = max(moved, key=lambda name: moved[name], default="")
         by, errs = moved.get(most, np.inf) ** 0.5, step.get(most, 0.0)
         if other.gap.after <= AGREEMENT_RMS_MAX and by <= errs:
