@@ -193,18 +193,12 @@ def above_step(
         if first is None or not first.gap.is_measured:
             break
         gone = [choice.effect for choice in unit]
-        fewer = without(problem, selection, *gone)
         names = {(e.kind, tuple(e.at)) for e in gone}  # Fits change the parameters.
         rest = [e for e in selection.effects() if (e.kind, tuple(e.at)) not in names]
-        there = [(rest, selection), (fewer.effects(), fewer)]
-        found = [
-            problem.outcome(effects, some.start, some.end, some.nuisances, jobs=jobs)
-            for effects, some in there
-        ]
-        alone, other = (
-            x if x is not None and x.gap.is_measured else None for x in found
+        alone = problem.outcome(
+            rest, selection.start, selection.end, selection.nuisances, jobs=jobs
         )
-        if alone is None or other is None:
+        if alone is None or not alone.gap.is_measured:
             break
         with_it, without_it = (
             {name: each["after"] for name, each in found.gap.per_channel.items()}
@@ -216,7 +210,15 @@ def above_step(
         }  # fmt: skip
         most = max(moved, key=lambda name: moved[name], default="")
         by, errs = moved.get(most, np.inf) ** 0.5, step.get(most, 0.0)
-        if other.gap.after <= AGREEMENT_RMS_MAX and by <= errs:
+        if by > errs:
+            continue
+        fewer = without(problem, selection, *gone)
+        other = problem.outcome(
+            fewer.effects(), fewer.start, fewer.end, fewer.nuisances, jobs=jobs
+        )
+        if other is None or not other.gap.is_measured:
+            break
+        if other.gap.after <= AGREEMENT_RMS_MAX:
             why = (
                 "It moves simulated windows, with what else moves them as little, by "
                 f"{by:.2g} times the expected error at {most}, no more than the "
