@@ -9,6 +9,7 @@ from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource
 
 from makebreak.benchmarks import parameter_learner as bench
+from makebreak.benchmarks import plants
 from makebreak.benchmarks.plants import diagram_of
 from makebreak.diagrams.push_object_config import (
     STEADY,
@@ -672,6 +673,92 @@ def test_a_cone_that_is_not_round_leaves_the_force_along_its_first_axis_free():
             np.testing.assert_allclose(push[2] - normal[2], [-1.6, 1.6], atol=1e-9)
             shrunk = 1.0 - 0.5 * (0.01 / 0.3) ** 2
             np.testing.assert_allclose(push[1], -BOX_MU * shrunk, atol=1e-9)
+
+
+@pytest.mark.parametrize("axes", [plants.XY, plants.XYZ], ids=len)
+@pytest.mark.parametrize(
+    ("place", "gap_std", "turns"),
+    [("corner", 1e-3, 1.0), ("side", 1e-3, 0.0), ("corner", 0.0, 0.0)],
+)
+def test_where_a_surface_is_turns_the_normal_of_a_corner(axes, place, gap_std, turns):
+    """A tip of radius R at a corner that may be off by its gap's deviation s along
+    itself: a force f is turned by s / R."""
+    R, f, corner = 0.02, 3.0, place == "corner"
+    text = plants.finger("tip", axes, "0 0 0", R)
+    text += plants.fixed("wall", plants.box(0.1, 0.2, 1.0), "0 0 0")
+    plane = [0.0, 0.0, 1.0] if len(axes) == 2 else []
+    pair = ContactPair("tip", "wall", BOX_MU, len(axes) - 1, plane_normal=plane)
+    items = [Parameter("friction", 0.5, pairs=[0])]
+    if gap_std:
+        items.append(Parameter("gap", gap_std, pairs=[0]))
+    config = ParameterLearnerConfig([pair], items, error_share=0.0, impact_share=0.0)
+    learner = ParameterLearner(diagram_of(plants.sdf(text))[0], config, 0.05)
+    x, way = learner.model.x_default.copy(), np.array([0.6, 0.8] if corner else [1, 0])
+    x[:2] = [0.05, 0.1 * corner] + R * way
+    sample = Sample(x, np.zeros(len(axes)), x, *learner.model.between(x, x))
+    lcs = learner.model.build(x, sample.u)
+    ones = np.ones(lcs.n_lam)
+    found = learner._elsewhere(sample, lcs, BOX_MU * ones, ones, f / lcs.n_lam * ones)
+    across = np.zeros(len(axes))
+    across[:2] = -way[1], way[0]
+    change = turns * np.linalg.solve(sample.M, 0.05 * f * 1e-3 / R * across)
+    # To the next order in s / R.
+    np.testing.assert_allclose(found, np.outer(change, change), rtol=0.02, atol=1e-9)
+    u = np.zeros(len(axes))
+    u[:2] = -f * way  # What the wall holds.
+    sample = Sample(x, u, x, sample.v_mean, sample.M)
+    loss, _ = learner._loss_of(prior(len(items)), sample, lambda z: lcs)
+    W = loss.W[len(x) // 2 :, len(x) // 2 :]
+    expected = np.linalg.inv(np.eye(len(axes)) * 1e-4 + np.outer(change, change))
+    np.testing.assert_allclose(W, expected, rtol=0.05, atol=100.0)
+
+
+def test_where_surfaces_meet_the_normal_may_be_that_of_the_other_one():
+    """A tip slides along a wall, half a millimetre before it meets another one."""
+    R, s, f = 0.02, 1e-3, 3.0
+    walls = plants.shape("a", plants.box(0.1, 0.4, 1.0), f"{-0.05 - R} 0 0")
+    walls += plants.shape("b", plants.box(0.4, 0.1, 1.0), f"0 {-0.05 - R - 0.5 * s} 0")
+    text = plants.finger("tip", plants.XY, "0 0 0", R) + plants.link("w", 1.0, walls)
+    text += plants.joint("w", "0 0 1", kind="fixed", driven=False)
+    pair = ContactPair("tip", "w", BOX_MU, 1, plane_normal=[0, 0, 1], closest=1)
+    items = [Parameter("gap", s, pairs=[0])]
+    learner = ParameterLearner(
+        diagram_of(plants.sdf(text))[0], ParameterLearnerConfig([pair], items), 0.05
+    )
+    x, ones = learner.model.x_default, np.ones(2)
+    sample = Sample(x, 0.0 * ones, x, *learner.model.between(x, x))
+    lcs = learner.model.build(x, sample.u)
+    found = learner._elsewhere(sample, lcs, BOX_MU * ones, ones, 0.5 * f * ones)
+    change = 0.05 * f * np.linalg.solve(sample.M, [0.0, 1.0])
+    # On one side of where it is, of two.
+    np.testing.assert_allclose(found, 0.5 * np.outer(change, change), atol=1e-12)
+
+
+@pytest.mark.parametrize("speed", [0.3, 0.0])
+@pytest.mark.parametrize("tilt", [-0.6, 0.0, 0.6])
+def test_the_friction_of_a_finger_that_leans_is_that_of_its_tilted_normal(tilt, speed):
+    """A tip slides along a wall by a normal that is tilted up or down, with half the
+    model's friction, or just sticks, with 1.6 times the model's. (It was learned as 1 /
+    cos(tilt) times as large.)"""
+    mu, R = 0.4, 0.02
+    model_mu, N, steps = (2.0 * mu, 3.0, 40) if speed else (mu / 1.6, 12.0, 1)
+    text = plants.finger("tip", plants.XYZ, "0 0 0", R, 1.0)
+    text += plants.fixed("wall", plants.box(0.1, 0.2, 1.0), f"{0.05 + R} 0 0")
+    up = [0.0, 0.0, 1.0]
+    pair = ContactPair("tip", "wall", model_mu, tangent=up, anisotropy=4.0)
+    config = ParameterLearnerConfig(
+        [pair], [Parameter("friction", 0.5, pairs=[0])], error_share=0.0,
+        slip_noise=1e-3,
+    )  # fmt: skip
+    learner = ParameterLearner(diagram_of(plants.sdf(text))[0], config, 0.05)
+    x, x_next = speed * np.array([[0, -0.025, 0, 0, 1, 0], [0, 0.025, 0, 0, 1, 0]])
+    # At a constant speed the input is what the wall's force takes, and the weight.
+    u = N * np.array([np.cos(tilt), mu, np.sin(tilt)]) + [0.0, 0.0, 9.81]
+    sample, belief = Sample(x, u, x_next, *learner.model.between(x, x_next)), prior(1)
+    for _ in range(steps):
+        belief, _ = learner._learned(belief, sample)
+    # In deviations; the prior and the softness of the contact take a little.
+    assert belief.mean[0] == pytest.approx(np.log(mu / model_mu) / 0.5, abs=0.1)
 
 
 def test_a_force_at_a_distance_tells_of_no_mass():

@@ -28,9 +28,12 @@ from makebreak.systems.contact_mpc.numerics.parameter_posterior import (
     error_weights,
     explain,
     impact_part,
+    normals,
     prior,
     pushes,
     step_of,
+    tangent_edges,
+    tangents,
     updated,
 )
 from makebreak.systems.contact_mpc.numerics.residual_learner import gamma_bound
@@ -168,6 +171,9 @@ class ParameterLearner(LeafSystem):
         )
         self._friction = np.array([pair.friction for pair in c.contacts])
         self._high = np.array([pair.anisotropy for pair in c.contacts])
+        self._gap_std = m.parameters.of_pairs(
+            "gap", self._scale.std, np.zeros(len(c.contacts))
+        )
         self._drift = np.array([p.drift for p in c.parameters]) ** 2 * period_sec
         self._config, n = c, len(c.parameters)
         self._x = self.DeclareVectorInputPort("x", m.n_x)
@@ -320,6 +326,9 @@ class ParameterLearner(LeafSystem):
         )  # fmt: skip
         found = explain(lcs, sample, loss)
         if found is not None and found.lam.any():
+            acts = acting(lcs, sample, friction, c.slip_noise, high, found.lam)
+            loss = replace(loss, acting=acts)
+            found = explain(lcs, sample, loss) or found
             # Forces may act at the step's end instead of its beginning.
             before, after = (
                 pushes(model.build(x, sample.u, parameters=values))[0]
@@ -328,6 +337,7 @@ class ParameterLearner(LeafSystem):
             impulse = model.dt_sec * (after - before).T @ found.lam
             turned = np.linalg.solve(sample.M, impulse)
             further += np.outer(turned, turned) / 12.0
+            further += self._elsewhere(sample, lcs, friction, high, found.lam)
             for errors in acts.errors:
                 astray = (lcs.D @ (errors * found.f))[-model.n_v :]
                 further += astray @ astray.T
@@ -335,6 +345,26 @@ class ParameterLearner(LeafSystem):
         share = np.sqrt(c.error_share**2 + impacts)
         W = error_weights(self._Q_d, share, lacks, sample.M, further)
         return replace(loss, W=W), acts.slides
+
+    def _elsewhere(self, sample: Sample, lcs, friction, high, lam) -> np.ndarray:
+        """(n_v, n_v) covariance of a step's velocities from where contacts are: a
+        surface whose gap is not known is as far from where the model has it along
+        itself, too, and at a corner or on a ball the normal is then another one."""
+        model, found = self.model, np.zeros_like(sample.M)
+        off, contact = model.of_rows(lcs, self._gap_std), pushes(lcs)[2]
+        for one in np.unique(contact[(off > 0.0) & (lam > 0.0)]):
+            mine = contact == one
+            T, n = tangents(lcs, friction, mine, high[mine][0]), normals(lcs)[mine][0]
+            force = tangent_edges(friction, mine, high[mine][0]).T @ lam[mine]
+            ways = np.linalg.solve(sample.M, T.T).T
+            reach = np.maximum((T * ways).sum(axis=1), 1e-300)
+            ways *= off[mine][0] / reach[:, None]
+            turns = model.normals_beside(sample.x, [*ways, *-ways])[:, mine][:, 0]
+            for turn in turns:
+                change = lam[mine].sum() * turn @ T - force @ turn * n
+                change = model.dt_sec * np.linalg.solve(sample.M, change)
+                found += 0.5 * np.outer(change, change)
+        return found
 
 
 def _finer(pair: ContactPair) -> ContactPair:

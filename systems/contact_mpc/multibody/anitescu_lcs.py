@@ -29,6 +29,7 @@ from makebreak.systems.contact_mpc.numerics.constant_mass import (
     ConstantMassModel,
     build_many_constant_mass,
 )
+from makebreak.systems.contact_mpc.numerics.contact_rows import tangent_basis
 from makebreak.systems.contact_mpc.numerics.lcs import LCS, is_finite
 from makebreak.systems.contact_mpc.numerics.lcs_builder import assemble_lcs
 
@@ -214,6 +215,24 @@ class AnitescuLcs:
         _, N_plus = self._dynamics.velocity_maps(middle)
         M = self._plant.CalcMassMatrix(self._plant_context)
         return N_plus @ (q_next - q) / self.dt_sec, M
+
+    def normals_beside(self, x, ways) -> np.ndarray:
+        """(m, n_lam, 2) parts along the tangents of each row's contact at x (n_x,) of
+        its normal after a second of each of the velocities ways (m, n_v). The tangents
+        are those of the friction edges, in a plane t2 and -t1."""
+        plant, context, layout = self._plant, self._plant_context, self._contacts
+        q, found = x[: self.n_q], []
+        plant.SetPositions(context, q)
+        N, _ = self._dynamics.velocity_maps(q)
+        for way in (np.zeros(self.n_v), *ways):
+            plant.SetPositions(context, q + N @ way)
+            found.append(self._points.normals(context))
+        (n, chosen), *beside = found
+        basis = np.array(list(map(tangent_basis, n, layout.reference[chosen])))
+        parts = np.einsum("nik,mnk->mni", basis, [normal for normal, _ in beside])
+        planar = np.asarray(layout.planar)[chosen, None]
+        parts = np.where(planar, parts[..., ::-1] * [1.0, -1.0], parts)
+        return parts[:, layout.rows.contact]
 
     def step_changes(self, x, u, lcs: LCS, lam, parameters):
         """How a step changes with the parameters of bodies and joints, at the forces

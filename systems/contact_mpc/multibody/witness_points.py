@@ -88,6 +88,15 @@ class WitnessPoints:
             J[k] = np.stack([n, t1, t2]) @ J_w
         return phi, J, chosen
 
+    def normals(self, context: Context) -> tuple[np.ndarray, np.ndarray]:
+        """(n, 3) in the world, of the contacts that the LCS has at the state of the
+        plant's context, and their indices (n,)."""
+        found, layout = self._distances(context), self._layout
+        chosen = layout.every
+        if layout.chooses:
+            chosen = layout.nearest(np.array([gap for gap, *_ in found]))
+        return np.array([found[i][1] for i in chosen]), chosen
+
     def against_rolling(self, context: Context, chosen, lever, J_n, M, dt):
         """(n_contacts, n_v) generalized force of the resistance to rolling, for a
         normal force of 1 in each contact, at the state of the plant's context.

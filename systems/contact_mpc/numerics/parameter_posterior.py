@@ -148,7 +148,9 @@ class Explained:
     F: np.ndarray  # (m, m), of f
 
 
-def acting(lcs: LCS, sample: Sample, friction, noise: float, high=None) -> Acting:
+def acting(
+    lcs: LCS, sample: Sample, friction, noise: float, high=None, lam=None
+) -> Acting:
     """What the contacts' forces can be, by how they are seen to slide.
 
     A contact slides for certain where the slip's mean over the step is BEYOND_NOISE.
@@ -159,23 +161,28 @@ def acting(lcs: LCS, sample: Sample, friction, noise: float, high=None) -> Actin
     Args: friction (n_lam,) of the rows' contacts; noise [m/s] of the slip's speed;
         infinite: none slides. high (n_lam,): anisotropy of ContactPair; None: ones.
         Where it is not 1 the cone's first axis stands for forces that no slip tells:
-        any of them may act, and the contact slides if it does across that axis.
+        any of them may act, and the contact slides if it does across that axis. They
+        are those of a normal that is tilted, so the friction is that of both together:
+        lam (n_lam,) says how large they are; None: none.
     """
     J, _, contact = pushes(lcs)
     n_v, n = sample.v_mean.size, len(J)
-    along = (J - normals(lcs)) / np.where(friction > 0.0, friction, np.inf)[:, None]
-    ends = along @ np.stack([sample.x_now[-n_v:], sample.x_next[-n_v:]], axis=1)
+    v_ends = np.stack([sample.x_now[-n_v:], sample.x_next[-n_v:]])
     parts, slides = [np.zeros((4, n, 0))], np.zeros(n, bool)
     for one in np.unique(contact):
         mine = contact == one
         k, ratio = int(mine.sum()), 1.0 if high is None else high[mine][0]
-        axes = np.linalg.pinv(friction_edges(max(k // 2, 1)))[:, :k]
-        now, after = (axes @ ends[mine]).T
+        edges = friction_edges(max(k // 2, 1))[:k]
+        axes, tilted = np.linalg.pinv(edges), 1.0
+        now, after = v_ends @ tangents(lcs, friction, mine, ratio).T
         slip, change = 0.5 * (now + after), after - now
         error, spread = noise**2, np.zeros(1)
         if ratio != 1.0:
-            error, spread = error + (slip[0] / ratio) ** 2, np.array([-1.0, 1.0])
+            error, spread = error + slip[0] ** 2, np.array([-1.0, 1.0])
             slip[0] = change[0] = 0.0
+            if lam is not None and lam[mine].sum() > 0.0:
+                aside = tangent_edges(friction, mine, ratio)[:, 0] @ lam[mine]
+                tilted = np.hypot(1.0, aside / lam[mine].sum())
         error += change @ change / 12.0  # A slip that turns evenly.
         slides[mine] = slip @ slip > BEYOND_NOISE**2 * error
         if slides[mine].any():
@@ -183,10 +190,15 @@ def acting(lcs: LCS, sample: Sample, friction, noise: float, high=None) -> Actin
             angle = np.sqrt(error) / size  # By which the slip may be turned.
             against, across = np.array([-slip, [-slip[1], slip[0]]]) / size @ axes
             own = np.zeros((4, k, spread.size))
-            own[0] = (1.0 / k + (1.0 - 0.5 * angle**2) * against)[:, None]
+            own[0] = (1.0 / k + (1.0 - 0.5 * angle**2) * tilted * against)[:, None]
             own[0] += np.outer(axes[0], spread)
             own[2:] = np.stack([across, angle / np.sqrt(2.0) * against])[..., None]
             own[2:] *= angle
+        elif ratio != 1.0:
+            own = np.zeros((4, k, 4))
+            corners = axes[0] * np.array([[1.0], [1.0], [-1.0], [-1.0]])
+            corners = corners + tilted * axes[1] * np.array([[1.0], [-1.0]] * 2)
+            own[0] = 1.0 / k + corners.T
         else:
             own = np.zeros((4, k, k))
             own[0] = np.eye(k)
@@ -266,6 +278,22 @@ def normals(lcs: LCS) -> np.ndarray:
     same = (contact[:, None] == contact) & with_gap & with_gap[:, None]
     # The edges come in opposite pairs.
     return same @ J / np.maximum(same.sum(axis=1), 1)[:, None]
+
+
+def tangent_edges(friction, mine, high=1.0) -> np.ndarray:
+    """(k, 2) force along the two tangents of a contact, of each of its k rows.
+
+    Args: friction (n_lam,) of the rows' contacts; mine (n_lam,) bool: the contact's,
+        of which high is the anisotropy.
+    """
+    k = int(mine.sum())
+    return friction[mine][:, None] * friction_edges(max(k // 2, 1))[:k] * [high, 1.0]
+
+
+def tangents(lcs: LCS, friction, mine, high=1.0) -> np.ndarray:
+    """(2, n_v) what moves a contact along its two tangents: as of tangent_edges."""
+    along = (pushes(lcs)[0] - normals(lcs))[mine]
+    return np.linalg.pinv(tangent_edges(friction, mine, high)) @ along
 
 
 def nearest(lcs: LCS, sample: Sample) -> np.ndarray:
