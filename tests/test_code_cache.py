@@ -1,5 +1,6 @@
 """Compiled functions are found again wherever their sources are the same."""
 
+import gc
 import os
 import re
 import shutil
@@ -9,8 +10,9 @@ from importlib import import_module
 from pathlib import Path
 
 import numba
+import numpy as np
 import pytest
-from numba.core import caching
+from numba.core import caching, event
 from numba.core.registry import CPUDispatcher
 
 from makebreak.systems.numerics import code_cache, filters
@@ -162,3 +164,32 @@ def test_code_that_cannot_be_written_serves_this_process_alone(monkeypatch, tmp_
 
 def _double(x):
     return 2.0 * x
+
+
+def test_nothing_is_collected_while_numba_compiles():
+    seen = []
+
+    class Seen(event.Listener):
+        def on_start(self, event):
+            seen.append(gc.isenabled())
+
+        def on_end(self, event):
+            pass
+
+    with event.install_listener("numba:compile", Seen()):
+        assert numba.njit(_double)(2.0) == 4.0
+        with pytest.raises(numba.TypingError):
+            numba.njit(_double)(None)
+    assert len(seen) > 1 and not any(seen)
+    assert gc.isenabled()
+
+
+def test_an_array_of_another_shape_is_refused_by_compiled_code():
+    @numba.njit
+    def head(out, values):
+        out[:2] = values
+        return out
+
+    np.testing.assert_array_equal(head(np.zeros(3), np.ones(2)), [1.0, 1.0, 0.0])
+    with pytest.raises(ValueError, match="slice of another shape"):
+        head(np.zeros(3), np.ones(3))
