@@ -108,21 +108,19 @@ def admm_plus(AB, d, C, c, Q, R, Q_N, G, bounds, U, h, x0, lam0, delta, w, round
     x, v = np.empty((N + 1, len(Q_N))), np.empty((N, n_lam + len(R)))
     z, sides = np.empty((N, n_z)), np.zeros((N + 1, AB.shape[2]), np.int64)
     inputs = np.zeros((rounds + 1, N, len(R)))
-    for r in range(rounds):
+    for r in range(rounds + 1):
+        target = delta - w if r < rounds else delta
         status = qp_step(
-            model, (Q, R, Q_N, G), bounds, (h, delta - w, x0, lam0), (z, x, v, sides)
+            model, (Q, R, Q_N, G), bounds, (h, target, x0, lam0), (z, x, v, sides)
         )
-        if status != SOLVED:
-            return status, x, v, delta, w, inputs
+        if r == rounds or status != SOLVED:
+            break
         inputs[r] = v[:, n_lam:]
         delta = np.empty((N, n_z))
         project_plus(z + w, U, len(Q_N), n_lam, delta)
         w = (w + z - delta) / rho
         G = rho * G
-    status = qp_step(
-        model, (Q, R, Q_N, G), bounds, (h, delta, x0, lam0), (z, x, v, sides)
-    )
-    inputs[rounds] = v[:, n_lam:]
+    inputs[r] = v[:, n_lam:]
     return status, x, v, delta, w, inputs
 
 

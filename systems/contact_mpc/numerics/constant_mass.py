@@ -189,17 +189,21 @@ def _build_constant_mass(
     for i in range(n_c):
         a, b = pairs[i]
         phi[i], n, on_a, on_b = _distance(a, b, shape, size, R_W, p_W)
-        J_w = point_jacobian(on_a - origin[a], omega[a], J_p[a])
-        J_w -= point_jacobian(on_b - origin[b], omega[b], J_p[b])
+        J_a = point_jacobian(on_a - origin[a], omega[a], J_p[a])
+        J_b = point_jacobian(on_b - origin[b], omega[b], J_p[b])
+        J_w = J_a - J_b
         t1, t2 = tangent_basis(n, reference[i])
-        J[i, 0], J[i, 1], J[i, 2] = n @ J_w, t1 @ J_w, t2 @ J_w
-        J_n[i] = J[i, 0]
+        along, across, aside = n @ J_w, t1 @ J_w, t2 @ J_w
+        for j in range(n_v):
+            J[i, 0, j], J[i, 1, j], J[i, 2, j] = along[j], across[j], aside[j]
+            J_n[i, j] = along[j]
     # Of each force: what it pushes along, and its gap.
     J_c, phi_lam = np.empty((n_lam, n_v)), np.empty(n_lam)
     for k in range(n_lam):
         i = contact[k]
-        J_t = edge[k, 0] * J[i, 1] + edge[k, 1] * J[i, 2]
-        J_c[k] = normal[k] * J[i, 0] + weight[k] * J_t
+        for j in range(n_v):
+            J_t = edge[k, 0] * J[i, 1, j] + edge[k, 1] * J[i, 2, j]
+            J_c[k, j] = normal[k] * J[i, 0, j] + weight[k] * J_t
         phi_lam[k] = phi[i] if normal[k] > 0.0 else np.inf
     # Acceleration without contact, with the gyroscopic terms of bodies that turn.
     f = f_0 + J_v @ v + J_u @ u
@@ -208,13 +212,17 @@ def _build_constant_mass(
         M_inv, J_v = M_inv.copy(), J_v.copy()
     for i in range(len(turning)):
         a, b = turning[i]
-        of = slice(b, b + 6)
         R_WB = rotation(q[a], q[a + 1], q[a + 2], q[a + 3])
         f_i, J_angle, J_w, M_inv_i = rigid_body(R_WB, v[b : b + 3], body[i])
-        f[of] += f_i
-        J_q[of, a : a + 4] = J_angle @ N_plus[b : b + 3, a : a + 4].copy()
-        J_v[of, b : b + 3] += J_w
-        M_inv[of, of] = M_inv_i
+        turned = J_angle @ N_plus[b : b + 3, a : a + 4].copy()
+        for j in range(6):
+            f[b + j] += f_i[j]
+            for m in range(4):
+                J_q[b + j, a + m] = turned[j, m]
+            for m in range(3):
+                J_v[b + j, b + m] += J_w[j, m]
+            for m in range(6):
+                M_inv[b + j, b + m] = M_inv_i[j, m]
     A, B, D, d, E, F, H, c = assemble(
         x, f, J_q, J_v, J_u, u, M_inv @ J_c.T, N, N_plus, phi, J_n,
         J_c, contact, normal, F_0, dt,

@@ -118,7 +118,12 @@ def solve_lcp_kernel(F, q):
     # the search. Where that finds nothing either, a more regular F and 1e-7 have to do.
     if not best < 1e-9:
         for more, rebuild, most in ((1e-12, 0, 1e-9), (1e-8, REBUILD, 1e-7)):
-            if _regular(M, b, more, rebuild, found) < most:
+            R = M.copy()
+            for i in range(n):
+                R[i, i] += more
+            z, ended, basic = _lemke(R, b, 1e-13, rebuild)
+            if ended == SOLVED and _violation(M, b, z) * max(1.0, z.max()) < most:
+                found[:] = z
                 break
             if rebuild == 0 and _search(M, b, found):
                 break
@@ -171,7 +176,7 @@ def _units(F):
     return unit
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _solve_small(M, b, basic, rebuild, z):
     """Solves what is below SMALL in the solution z (n,) once more, in a unit of its
     own, with the other contacts as they are in `basic` (n,); overwrites both."""
@@ -200,18 +205,7 @@ def _solve_small(M, b, basic, rebuild, z):
             z[others[i] - n] = unit * y[i]
 
 
-@njit(cache=True)
-def _regular(M, b, more, rebuild, z):
-    """Fills z (n,) with the solution for `more` on M's diagonal; returns its violation
-    in the LCP itself, times |z| if large; infinite without a solution."""
-    R = M.copy()
-    for i in range(b.size):
-        R[i, i] += more
-    z[:], status, _ = _lemke(R, b, 1e-13, rebuild)
-    return _violation(M, b, z) * max(1.0, z.max()) if status == SOLVED else np.inf
-
-
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _search(M, b, z):
     """Looks for a solution mode by mode; fills z (n,), returns whether there is one."""
     n = b.size

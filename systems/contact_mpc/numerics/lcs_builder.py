@@ -81,6 +81,17 @@ def is_finite_model(c, d, F):
 
 
 @njit(cache=True)
+def _stepped(N, V, dt):
+    """[dt N V, V]: q_next - q and v_next of V (n_v, m), by q_next = q + dt N v_next."""
+    n_q, m = N.shape[0], V.shape[1]
+    out, moved = np.empty((n_q + V.shape[0], m)), N @ V
+    for i in range(len(out)):
+        for j in range(m):
+            out[i, j] = dt * moved[i, j] if i < n_q else V[i - n_q, j]
+    return out
+
+
+@njit(cache=True)
 def assemble(
     x, f, J_q, J_v, J_u, u, M_inv_J_cT, N, N_plus, phi, J_n, J_c, contact, normal,
     F_0, dt,
@@ -88,34 +99,34 @@ def assemble(
     """A, B, D, d, E, F, H, c of assemble_lcs, whose arguments these are but for
     M_inv_J_cT (n_v, n_lam) = M^-1 J_c'. Compiled."""
     n_v, n_q = J_q.shape
-    n_x, n_u, n_lam = n_q + n_v, J_u.shape[1], contact.size
+    n_x, n_lam = n_q + n_v, contact.size
     q, v = x[:n_q].copy(), x[n_q:].copy()
     d_v = f - J_q @ q - J_v @ v - J_u @ u
-    A, B, d = np.zeros((n_x, n_x)), np.empty((n_x, n_u)), np.empty(n_x)
-    D, E = np.empty((n_x, n_lam)), np.empty((n_lam, n_x))
-    # Velocity rows first; the position rows follow from q_next = q + dt N v_next.
+    # Loops, as an array that is assigned to a slice takes ten times as long to compile.
     V = np.empty((n_v, n_x))  # Derivative of v_next.
-    V[:, :n_q] = dt * J_q
-    V[:, n_q:] = dt * J_v
     for i in range(n_v):
+        for j in range(n_q):
+            V[i, j] = dt * J_q[i, j]
+        for j in range(n_v):
+            V[i, n_q + j] = dt * J_v[i, j]
         V[i, n_q + i] += 1.0
-    A[n_q:] = V
-    A[:n_q] = dt * (N @ V)
+    V_u, V_0, V_lam = dt * J_u, dt * d_v, dt * M_inv_J_cT
+    A, B, D = _stepped(N, V, dt), _stepped(N, V_u, dt), _stepped(N, V_lam, dt)
     for i in range(n_q):
         A[i, i] += 1.0
-    V_u, V_0, V_lam = dt * J_u, dt * d_v, dt * M_inv_J_cT
-    B[n_q:], B[:n_q] = V_u, dt * (N @ V_u)
-    d[n_q:], d[:n_q] = V_0, dt * (N @ V_0)
-    D[n_q:], D[:n_q] = V_lam, dt * (N @ V_lam)
+    d, moved = np.empty(n_x), N @ V_0
+    for i in range(n_x):
+        d[i] = dt * moved[i] if i < n_q else V_0[i - n_q]
     gap_rate = (J_n @ N_plus) / dt  # Of the gaps per q, over dt.
     gap_0 = phi / dt - gap_rate @ q
-    E[:] = J_c @ V
+    E = J_c @ V
     H = J_c @ V_u
     F = J_c @ V_lam
     c = J_c @ V_0
     for i in range(n_lam):
         if normal[i] > 0.0:
-            E[i, :n_q] += gap_rate[contact[i]]
+            for j in range(n_q):
+                E[i, j] += gap_rate[contact[i], j]
             c[i] += gap_0[contact[i]]
         for j in range(n_lam):
             F[i, j] += F_0[i, j]

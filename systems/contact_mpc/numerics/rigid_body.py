@@ -35,9 +35,10 @@ def velocity_maps(q, plain, floating, n_v):
         L[1, 0], L[1, 1], L[1, 2] = w, z, -y
         L[2, 0], L[2, 1], L[2, 2] = -z, w, x
         L[3, 0], L[3, 1], L[3, 2] = y, -x, w
-        N[a : a + 4, b : b + 3] = 0.5 * L
-        N_plus[b : b + 3, a : a + 4] = 2.0 * L.T
         for k in range(3):
+            for j in range(4):
+                N[a + j, b + k] = 0.5 * L[j, k]
+                N_plus[b + k, a + j] = 2.0 * L[j, k]
             N[a + 4 + k, b + 3 + k] = 1.0
             N_plus[b + 3 + k, a + 4 + k] = 1.0
     return N, N_plus
@@ -66,6 +67,23 @@ def _cross(a):
 
 
 @njit(cache=True)
+def _times(a, b):
+    """a x b (3,)."""
+    out = np.empty(3)
+    out[0], out[1] = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2]
+    out[2] = a[0] * b[1] - a[1] * b[0]
+    return out
+
+
+@njit(cache=True)
+def _put(out, row, column, block):
+    """Copies the block (3, 3) into out. Compiles far faster than a slice of out."""
+    for i in range(3):
+        for j in range(3):
+            out[row + i, column + j] = block[i, j]
+
+
+@njit(cache=True)
 def rigid_body(R, omega, body):
     """A free rigid body that turns, beside its weight.
 
@@ -83,22 +101,21 @@ def rigid_body(R, omega, body):
     inertia, c, mass = body[:3].copy(), body[3].copy(), body[4, 0]
     w, I_inv = R.T @ omega, np.linalg.inv(inertia)
     C = _cross(c)
-    dw = -I_inv @ np.cross(w, inertia @ w)
-    F = np.empty((2, 3))
-    F[0] = dw
-    F[1] = C @ dw - np.cross(w, np.cross(w, c))
+    dw = -I_inv @ _times(w, inertia @ w)
+    F_v = C @ dw - _times(w, _times(w, c))
     G_w = -I_inv @ (_cross(w) @ inertia - _cross(inertia @ w))
-    G_v = C @ G_w + _cross(np.cross(w, c)) + _cross(w) @ C
+    G_v = C @ G_w + _cross(_times(w, c)) + _cross(w) @ C
     f, J_angle, J_w = np.empty(6), np.empty((6, 3)), np.empty((6, 3))
-    for i, G in enumerate((G_w, G_v)):
-        of = slice(3 * i, 3 * i + 3)
-        f[of] = R @ F[i]
-        J_w[of] = R @ G @ R.T
-        J_angle[of] = R @ G @ R.T @ _cross(omega) - _cross(f[of])
+    for i, F, G in ((0, dw, G_w), (3, F_v, G_v)):
+        f_i, J_i = R @ F, R @ G @ R.T
+        for k in range(3):
+            f[i + k] = f_i[k]
+        _put(J_w, i, 0, J_i)
+        _put(J_angle, i, 0, J_i @ _cross(omega) - _cross(f_i))
     # v_origin = v_centre + C omega.
     M_inv, I_W, C_W = np.empty((6, 6)), R @ I_inv @ R.T, R @ C @ R.T
-    M_inv[:3, :3] = I_W
-    M_inv[:3, 3:] = I_W @ C_W.T
-    M_inv[3:, :3] = C_W @ I_W
-    M_inv[3:, 3:] = np.eye(3) / mass + C_W @ I_W @ C_W.T
+    _put(M_inv, 0, 0, I_W)
+    _put(M_inv, 0, 3, I_W @ C_W.T)
+    _put(M_inv, 3, 0, C_W @ I_W)
+    _put(M_inv, 3, 3, np.eye(3) / mass + C_W @ I_W @ C_W.T)
     return f, J_angle, J_w, M_inv
