@@ -117,6 +117,28 @@ class Law(NamedTuple):
     laws: JointLaws  # Forces in the joints, as of joint_friction.to_compensate.
 
 
+# A slice that is assigned, or a sum of products of slices, takes three times as long to
+# compile as a call.
+@numba.njit(cache=True)
+def _copy(out, values):
+    for k in range(out.size):
+        out[k] = values[k]
+
+
+@numba.njit(cache=True)
+def _dot3(a, b):
+    """Of the first three entries."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@numba.njit(cache=True)
+def _is_finite(values):
+    for value in values:
+        if not np.isfinite(value):
+            return False
+    return True
+
+
 @numba.njit(cache=True)
 def law_of(flat):
     """The Law of which `flat` is the packed array; arrays of floats are not copied."""
@@ -228,8 +250,8 @@ def posture_step(chain, law, q_n, p_tip):
     p, R, J = tip_kinematics(chain, q_n)
     pull = 0.05 * (law.q_nominal - q_n)
     error = np.empty(6)
-    error[:3] = p_tip - p
-    error[3:] = rotation_error(law.R_upright, R)
+    _copy(error[:3], p_tip - p)
+    _copy(error[3:], rotation_error(law.R_upright, R))
     step = pull + _damped_inverse(J, error - J @ pull)
     out = np.empty(n)
     for i in range(n):
@@ -294,11 +316,11 @@ def force_control(law, slots, directions, targets, measured):
     slots[:, ACTIVE] = 0.0
     for k in range(2):
         n = rows[k]
-        if np.sum(n**2) == 0.0:
+        if _dot3(n, n) == 0.0:
             continue
         best, best_cosine = -1, SAME_DIRECTION
         for j in range(N_SLOTS):
-            cosine = np.sum(slots[j, :3] * n)
+            cosine = _dot3(slots[j], n)
             free = slots[j, WEIGHT] > 0.0 and slots[j, ACTIVE] == 0.0
             if free and cosine > best_cosine:
                 best, best_cosine = j, cosine
@@ -309,14 +331,14 @@ def force_control(law, slots, directions, targets, measured):
                     best, least = j, slots[j, WEIGHT]
             slots[best] = 0.0
         slot = slots[best]
-        slot[:3] = n
+        _copy(slot[:3], n)
         slot[ACTIVE] = 1.0
         target = max(targets[k], 0.0)
         # Proportional to the force, so that every ramp takes the same time.
         step = max(target, slot[LEVEL]) * law.period / force.ramp_sec
         slot[LEVEL] += min(max(target - slot[LEVEL], -step), step)
         slot[DAMPING] = max(target / force.closing_speed, force.normal_damping)
-        felt = -np.sum(n * measured[:3]) if sensed else 0.0
+        felt = -_dot3(n, measured) if sensed else 0.0
         gain, missing = 0.0, 0.0
         if felt >= CONTACT_FORCE_MIN:
             gain, missing = force.integral_gain, slot[LEVEL] - felt
@@ -345,12 +367,14 @@ def _under_motion_control(slots, scale, motion):
     Args: slots (N_SLOTS, SLOT); scale: of the gains about the axes; motion (m,).
     """
     out = motion.copy()
-    out[3:] *= np.sqrt(scale)
+    for k in range(3, out.size):
+        out[k] *= np.sqrt(scale)
     for j in range(slots.shape[0]):
         if slots[j, WEIGHT] > 0.0:
             n_j = slots[j, :3]
-            along = np.sum(n_j * out[:3])
-            out[:3] -= (1.0 - np.sqrt(1.0 - slots[j, WEIGHT])) * along * n_j
+            less = (1.0 - np.sqrt(1.0 - slots[j, WEIGHT])) * _dot3(n_j, out)
+            for k in range(3):
+                out[k] -= less * n_j[k]
     return out
 
 
@@ -377,11 +401,11 @@ def impedance_torque(
     L = np.zeros((n, n))
     cholesky(L, s.M)  # Positive definite by construction.
     X = np.ascontiguousarray(J.T)
-    column = np.empty(n)
     for j in range(m):
-        column[:] = X[:, j]
+        column = X[:, j].copy()
         forward_solve(L, column)
-        X[:, j] = column
+        for i in range(n):
+            X[i, j] = column[i]
     mobility = X.T @ X  # J inv(M) J'
     largest = 1e-3  # A tip that no joint moves has one, too [1/kg].
     for i in range(m):
@@ -401,9 +425,12 @@ def impedance_torque(
             damping[i] = 2.0 * ratio * np.sqrt(damping[i] / mobility[i, i])
     twist = J @ v
     error, rate = np.empty(m), np.empty(m)
-    error[:3], rate[:3] = x_d[:3] - s.p_WE, x_d[7:10] - twist[:3]
     a_ref, moves = np.empty(m), np.zeros(6)  # The reference across the forces.
-    a_ref[:3], moves[:3] = x_d[13:16], x_d[7:10]
+    for k in range(m):
+        rate[k] = x_d[7 + k] - twist[k]
+        a_ref[k], moves[k] = x_d[13 + k], x_d[7 + k]
+    for k in range(3):
+        error[k] = x_d[k] - s.p_WE[k]
     scale = 1.0  # Of stiffness and damping about the axes.
     if m == 6:
         # Explicit damping d is stable while d period < inertia. The wrist's inertia may
@@ -411,35 +438,39 @@ def impedance_torque(
         turning = mobility[3, 3] + mobility[4, 4] + mobility[5, 5]
         most = max(damping[3], damping[4], damping[5]) * turning * law.period
         scale = 1.0 if most < 0.5 else 0.5 / most
-        error[3:] = rotation_error(R_d, s.R_WE)
-        rate[3:] = x_d[10:13] - twist[3:]
-        a_ref[3:], moves[3:] = x_d[16:19], x_d[10:13]
+        _copy(error[3:], rotation_error(R_d, s.R_WE))
     stored = _under_motion_control(slots, scale, error)
     stiffness = paid_stiffness(tank, stiffness, stored, law.tank)
     lost = _under_motion_control(slots, scale, rate)
     F = stiffness[:m] * error + damping[:m] * rate
-    pushing = np.sqrt(np.sum(F[:3] ** 2))
+    pushing = np.sqrt(_dot3(F, F))
     if pushing > law.force_max:
-        F[:3] *= law.force_max / pushing
-        lost[:3] *= np.sqrt(law.force_max / pushing)
+        for k in range(3):
+            F[k] *= law.force_max / pushing
+            lost[k] *= np.sqrt(law.force_max / pushing)
     fill(tank, damping, lost, lag, law.period, law.tank)
-    F[3:] *= scale
+    for k in range(3, m):
+        F[k] *= scale
     for j in range(slots.shape[0]):
         weight = slots[j, WEIGHT]
         if weight > 0.0:  # Motion control only across n; along n the push.
             n_j = slots[j, :3]
-            v_n = np.sum(n_j * twist[:3])
+            v_n = _dot3(n_j, twist)
             slots[j, SPEED] = v_n + law.force.speed_keep * (slots[j, SPEED] - v_n)
             push = max(slots[j, LEVEL] + slots[j, INTEGRAL], 0.0)
             push -= slots[j, DAMPING] * slots[j, SPEED]
-            F[:3] += weight * (push - np.sum(n_j * F[:3])) * n_j
-            a_ref[:3] -= weight * np.sum(n_j * a_ref[:3]) * n_j
-            moves[:3] -= weight * np.sum(n_j * moves[:3]) * n_j
+            more = weight * (push - _dot3(n_j, F))
+            a_along = weight * _dot3(n_j, a_ref)
+            v_along = weight * _dot3(n_j, moves)
+            for k in range(3):
+                F[k] += more * n_j[k]
+                a_ref[k] -= a_along * n_j[k]
+                moves[k] -= v_along * n_j[k]
     F += wrench[:m]
 
     # Posture: its acceleration, minus the part that would move the tip.
     follow = np.zeros(6)
-    follow[:m] = twist
+    _copy(follow[:m], twist)
     v_n = _damped_inverse(s.J, follow)
     qdd = law.posture_stiffness * (q_n - q) + law.posture_damping * (v_n - v)
     if n <= m:  # No null space: the posture would only act through errors of Lambda.
@@ -512,33 +543,33 @@ def tick(
     status = 0
     count = memory[2 * n + 7]
     has_pose, has_q = memory[2 * n + 8] > 0.0, memory[2 * n + 9] > 0.0
-    sensed = np.all(np.isfinite(q)) and np.all(np.isfinite(v))
+    sensed = _is_finite(q) and _is_finite(v)
     if sensed:
         if not has_q:
-            memory[:n] = q
-        memory[n : 2 * n] = q
-        memory[-n:] = v
+            _copy(memory[:n], q)
+        _copy(memory[n : 2 * n], q)
+        _copy(memory[-n:], v)
         memory[2 * n + 9] = 1.0
         q_now, v_now = q, v
     else:
         status |= SENSORS_HELD
         if has_q:
             q_now, v_now = held_motion(q, v, memory[n : 2 * n], memory[-n:], law.period)
-            memory[n : 2 * n] = q_now
-            memory[-n:] = v_now
+            _copy(memory[n : 2 * n], q_now)
+            _copy(memory[-n:], v_now)
         else:
             q_now, v_now = law.q_nominal.copy(), np.zeros(n)
 
     x_d, R_d, held = _reference(chain, memory, q_now, x_d, has_pose, n)
     if held:
         status |= REFERENCE_HELD
-    if not (np.all(np.isfinite(stiffness)) and np.all(stiffness >= 0.0)):
+    if not (_is_finite(stiffness) and np.all(stiffness >= 0.0)):
         stiffness = law.stiffness.copy()
         status |= REFERENCE_HELD
-    if not (np.all(np.isfinite(damping)) and np.all(damping >= 0.0)):
+    if not (_is_finite(damping) and np.all(damping >= 0.0)):
         damping = law.stiffness.copy() if ratio > 0.0 else law.damping.copy()
         status |= REFERENCE_HELD
-    if not np.all(np.isfinite(wrench)):
+    if not _is_finite(wrench):
         wrench = np.zeros(6)
         status |= REFERENCE_HELD
     if not 0.0 <= delay < np.inf:  # With NaN the brakes would do nothing.
@@ -546,12 +577,12 @@ def tick(
         status |= REFERENCE_HELD
 
     kept = memory[2 * n + 10 : 2 * n + 18]
-    if np.all(np.isfinite(directions)) and np.all(np.isfinite(targets)):
-        kept[:6] = directions
-        kept[6:] = targets
+    if _is_finite(directions) and _is_finite(targets):
+        _copy(kept[:6], directions)
+        _copy(kept[6:], targets)
     else:
         status |= REFERENCE_HELD
-    if not np.all(np.isfinite(measured)):
+    if not _is_finite(measured):
         measured = np.zeros(0)
         status |= FORCE_SENSOR_HELD
     slots = memory[2 * n + 18 : -n - N_TANK].reshape(N_SLOTS, SLOT)
@@ -575,11 +606,11 @@ def tick(
             delay + 0.5 * law.period,
         )
         if count % law.posture_every == 0:
-            memory[:n] = posture_step(chain, law, memory[:n].copy(), p_tip)
+            _copy(memory[:n], posture_step(chain, law, memory[:n].copy(), p_tip))
     else:  # Carry the arm and slow it down: qdd = -HOLD_DAMPING v.
         now = chain_state(chain, q_now, v_now)
         asked = now.bias - chain.damping * v_now - HOLD_DAMPING * (now.M @ v_now)
-    if not np.all(np.isfinite(asked)):  # Overflow.
+    if not _is_finite(asked):  # Overflow.
         asked = chain_state(chain, q_now, np.zeros(n)).bias
         status |= REFERENCE_HELD
     memory[2 * n + 7] = (count + 1) % law.posture_every
@@ -588,9 +619,9 @@ def tick(
     if not is_free(law, q_now, v_now):
         now = chain_state(chain, q_now, v_now)
         kept, by = braked(law, tau, out, q_now, v_now, now.M, now.bias, delay)
-        if np.all(np.isfinite(kept)):  # Else an overflow.
+        if _is_finite(kept):  # Else an overflow.
             out, limited = kept, limited | by
-    tau[:] = out
+    _copy(tau, out)
     return status | limited
 
 
@@ -598,17 +629,17 @@ def tick(
 def _reference(chain, memory, q, x_d, has_pose, n):
     """x_d, its rotation, and whether it was replaced by the last good pose."""
     square = np.sum(x_d[3:7] ** 2)
-    if np.all(np.isfinite(x_d)) and 0.25 < square < 4.0:
-        memory[2 * n : 2 * n + 7] = x_d[:7]
+    if _is_finite(x_d) and 0.25 < square < 4.0:
+        _copy(memory[2 * n : 2 * n + 7], x_d[:7])
         memory[2 * n + 8] = 1.0
         return x_d, rotation_of(x_d[3:7]), False
     if not has_pose:  # Stay where the arm is.
         p, R, _ = tip_kinematics(chain, q)
-        memory[2 * n : 2 * n + 3] = p
-        memory[2 * n + 3 : 2 * n + 7] = quaternion_of(R)
+        _copy(memory[2 * n : 2 * n + 3], p)
+        _copy(memory[2 * n + 3 : 2 * n + 7], quaternion_of(R))
         memory[2 * n + 8] = 1.0
     held = np.zeros(19)
-    held[:7] = memory[2 * n : 2 * n + 7]
+    _copy(held[:7], memory[2 * n : 2 * n + 7])
     return held, rotation_of(held[3:7]), True
 
 
