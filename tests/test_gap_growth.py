@@ -84,3 +84,23 @@ def test_a_perfect_model_of_a_joint_on_its_head_leaves_the_noise(tmp_path, noise
     # Carried along a straight line, the start's error made it 1.8.
     ends = [x[-1] for x in e]
     assert np.sqrt(np.mean(np.square(ends))) == pytest.approx(1.0, abs=0.15)
+
+
+def test_one_row_with_a_wild_acceleration_makes_no_joint_fall(tmp_path):
+    """A smoothed acceleration of 100 Hz and more is noise of hundreds of rad/s^2."""
+    scene, recordings = upright(tmp_path, 0.05, seconds=5.0)
+    model = WindowModel(scene, recordings)
+    (path,) = model._paths.values()
+    states = {"p.j1.position": path["p.j1.position"]}
+    spreads = {"p.j1.position": np.tile(np.diag([1e-8, 1e-5, 1.0]), (500, 1, 1))}
+    rows, after = slice(100, 131), np.linspace(0.0, 0.3, 31)
+
+    def grown():
+        made = model._grown(recordings[0], states, spreads, rows, after, {})
+        return made["p.j1.position"][-1]
+
+    smooth = grown()
+    states["p.j1.position"] = states["p.j1.position"] + np.where(
+        np.arange(500)[:, None] % 2, [0.0, 0.0, 3e3], [0.0, 0.0, -3e3]
+    )
+    assert grown() == pytest.approx(smooth, rel=0.1)

@@ -544,13 +544,14 @@ class WindowModel(WindowedResidual):
             and set(joints) == set(self.joints)
         ):
             return {}
-        knots = np.linspace(rows.start, rows.stop - 1, 2 * PARTS + 1)
-        at = knots[1::2].round().astype(int)
+        parts = np.array_split(np.arange(rows.start, rows.stop), PARTS)
         q, v, vd = (np.zeros((PARTS, n)) for _ in range(3))
         start = np.zeros((2 * n, 2 * n))
         for name, i in joints.items():
             key = f"{name}.position"
-            q[:, i], v[:, i], vd[:, i] = states[key][at].T
+            # Means: one row's acceleration may be noise, and no joint falls by that.
+            of_parts = [states[key][part].mean(axis=0) for part in parts]
+            q[:, i], v[:, i], vd[:, i] = np.transpose(of_parts)
             start[np.ix_([i, n + i], [i, n + i])] = spreads[key][rows.start, :2, :2]
         white, steady = self._effort_noise(recording, joints, n)
         for name in self._untold:  # Of a smoothed acceleration, an effort's own.
