@@ -86,21 +86,25 @@ def test_a_perfect_model_of_a_joint_on_its_head_leaves_the_noise(tmp_path, noise
     assert np.sqrt(np.mean(np.square(ends))) == pytest.approx(1.0, abs=0.15)
 
 
-def test_one_row_with_a_wild_acceleration_makes_no_joint_fall(tmp_path):
-    """A smoothed acceleration of 100 Hz and more is noise of hundreds of rad/s^2."""
+def test_one_row_with_a_wild_acceleration_makes_no_joint_fall(tmp_path, monkeypatch):
+    """A smoothed acceleration of a fast log may be noise of hundreds of rad/s^2."""
     scene, recordings = upright(tmp_path, 0.05, seconds=5.0)
     model = WindowModel(scene, recordings)
+    asked = []
+    slopes = model.dynamics.slopes
+
+    def spied(q, v, vd):
+        asked.append(vd)
+        return slopes(q, v, vd)
+
+    monkeypatch.setattr(model.dynamics, "slopes", spied)
     (path,) = model._paths.values()
-    states = {"p.j1.position": path["p.j1.position"]}
-    spreads = {"p.j1.position": np.tile(np.diag([1e-8, 1e-5, 1.0]), (500, 1, 1))}
+    spreads = {"p.j1.position": np.zeros((500, 3, 3))}
     rows, after = slice(100, 131), np.linspace(0.0, 0.3, 31)
-
-    def grown():
-        made = model._grown(recordings[0], states, spreads, rows, after, {})
-        return made["p.j1.position"][-1]
-
-    smooth = grown()
-    states["p.j1.position"] = states["p.j1.position"] + np.where(
-        np.arange(500)[:, None] % 2, [0.0, 0.0, 3e3], [0.0, 0.0, -3e3]
-    )
-    assert grown() == pytest.approx(smooth, rel=0.1)
+    wild = np.where(np.arange(500) % 2, 300.0, -300.0)
+    for by in (0.0, wild):
+        state = path["p.j1.position"] + np.multiply.outer(by, [0.0, 0.0, 1.0])
+        states = {"p.j1.position": state.reshape(-1, 3)}
+        model._grown(recordings[0], states, spreads, rows, after, {})
+    # Of 10 or 11 rows the mean has at most an eleventh.
+    np.testing.assert_allclose(asked[1], asked[0], atol=30.0)
