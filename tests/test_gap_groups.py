@@ -10,6 +10,7 @@ from test_gap_sticking import recorded
 from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Candidate, Nuisances, SearchPlan
+from makebreak.gap.residuals.contact import _of_surfaces
 from makebreak.gap.residuals.mechanism import MechanismProblem
 from makebreak.gap.result import Estimate, Evidence, NamedEffect
 from makebreak.gap.said import said_together
@@ -64,23 +65,27 @@ def test_columns_of_a_gain_hold_however_far_it_is_off(tmp_path):
 
 def test_pairs_of_one_surface_may_have_one_friction():
     """The box is on the floor and at the rod, alike; a second box's friction differs,
-    and what the floor has with both is not alike."""
-    now = {"box~floor": 0.4, "box~rod": 0.4, "can~floor": 0.7}
-    X = np.eye(3)
-    pairs = [
-        Candidate(
-            "contact_friction", ("~".join(f"w.{b}" for b in at.split("~")),), 1,
-            (X[:, [k]],), (lambda c, mu=mu: {"friction": mu + c[0]},),
-        )
-        for k, (at, mu) in enumerate(now.items())
-    ]  # fmt: skip
-    each, shared = groups_of(pairs)
-    assert len(each.members) == 3 and not shared.members
+    and what the floor has with both is not alike. It slides only where both have less
+    than half of it."""
+    now = {"w.box~w.floor": 0.4, "w.box~w.rod": 0.4, "w.can~w.floor": 0.7}
+
+    def residual(effects):
+        (effect,) = effects
+        held = len(effect.at) < 2 or effect.parameters["friction"] > 0.2
+        return np.ones(6) if held else np.zeros(6)
+
+    model = SimpleNamespace(
+        places_of=lambda kind: list(now) if kind == "contact_friction" else [],
+        dynamics=SimpleNamespace(now=lambda kind, at: {"friction": now[at[0]]}),
+        residual=residual,
+    )
+    (shared,) = _of_surfaces(model, [], np.ones(6))
     assert (shared.at, shared.size) == (("w.box~w.floor", "w.box~w.rod"), 1)
-    np.testing.assert_array_equal(shared.columns[0], X[:, [0]] + X[:, [1]])
-    (effect,) = shared.effects(0, np.array([0.2]))
-    assert effect.parameters == {"friction": pytest.approx(0.6)}
-    assert effect.at == list(shared.at)
+    for x, read in zip(shared.columns, shared.to_parameters, strict=True):
+        c = np.linalg.lstsq(x, np.ones(6), rcond=None)[0]
+        assert read(c)["friction"] < 0.2
+    there = [Effect("contact_friction", ["w.box~w.rod"], {"friction": 0.3})]
+    assert not _of_surfaces(model, there, np.ones(6))
 
 
 KINDS = ("joint_coulomb_friction", "joint_viscous_damping", "rotor_inertia")

@@ -24,6 +24,8 @@ _TIMES = {
     "contact_dissipation": (0.05, 0.4, 1.1, 2.5),
     "object_mass": (0.7, 0.97, 1.4),
 }
+# The same of a surface: what stands on much friction shows nothing until it is little.
+_FAR_TIMES = np.array([0.9, 0.75, 0.6, 0.5, 0.42, 0.35, 0.29, 0.24, 0.2, 1.3, 2.0, 4.0])
 # Values tried where the scene has none.
 _FROM_NONE = {
     "contact_friction": (0.05, 0.2, 0.6),
@@ -112,10 +114,30 @@ def contact_candidates(
             for trials, names, fixed in _trials(model, kind, at):
                 pairs = one_size and KINDS[kind].at == "pair"
                 most = 1 if pairs else len(trials)
-                each = _of(model, kind, at, trials, names, fixed, there, r, most)
+                each = _of(model, kind, [at], trials, names, fixed, there, r, most)
                 if each is not None:
                     found.append(each)
-    return found
+    return found + (_of_surfaces(model, there, r) if one_size else [])
+
+
+def _of_surfaces(model, there: Sequence[Effect], r: np.ndarray) -> list[Candidate]:
+    """One value for all pairs of a body that have the same value now, tried at all of
+    them together: what stands on four feet does not slip on one of them."""
+    by: dict[tuple, list[str]] = {}
+    taken = {(e.kind, at) for e in there for at in e.at}
+    for kind in (k for k in _TIMES if KINDS[k].at == "pair"):
+        for at in model.places_of(kind):
+            ((name, value),) = model.dynamics.now(kind, [at]).items()
+            for body in at.split("~") if value and (kind, at) not in taken else ():
+                by.setdefault((kind, name, value, body), []).append(at)
+    found = {}
+    for (kind, name, value, _), some in by.items():
+        key = (kind, *some)
+        if len(some) > 1 and key not in found:
+            trials = [[(v - value, {name: v})] for v in value * _FAR_TIMES]
+            args = (trials, (name,), (), there, r, len(trials))
+            found[key] = _of(model, kind, some, *args)
+    return [each for each in found.values() if each is not None]
 
 
 def _is_alone(model: FreeBodyModel | WindowModel) -> bool:
@@ -315,9 +337,9 @@ def _moments(now: dict, name: str, factor: float) -> dict[str, float]:
 
 
 def _of(model, kind, at, trials, names, fixed, there, r, most) -> Candidate | None:
-    """With the first `most` of the trials that do something."""
+    """With the first `most` of the trials that do something, at all these places."""
     now = {p.name: p.neutral or 0.0 for p in KINDS[kind].parameters}
-    now |= model.dynamics.now(kind, [at])
+    now |= model.dynamics.now(kind, at)
     columns, readers = [], []
     reach = _reach(trials, names, now)
     known: dict[tuple, np.ndarray | None] = {}
@@ -326,7 +348,7 @@ def _of(model, kind, at, trials, names, fixed, there, r, most) -> Candidate | No
         for step, parameters in trial:
             key = tuple(parameters.items())
             if key not in known:
-                known[key] = _residual(model, *there, Effect(kind, [at], parameters))
+                known[key] = _residual(model, *there, Effect(kind, at, parameters))
             moved = known[key]
             if moved is None:
                 break
@@ -339,7 +361,7 @@ def _of(model, kind, at, trials, names, fixed, there, r, most) -> Candidate | No
             break
     if not columns:
         return None
-    return Candidate(kind, (at,), len(names), tuple(columns), tuple(readers), fixed)
+    return Candidate(kind, (*at,), len(names), tuple(columns), tuple(readers), fixed)
 
 
 def _reach(trials, names, now) -> dict[str, tuple[float, float]]:

@@ -42,27 +42,16 @@ def groups_of(found: Sequence[Candidate]) -> list[Candidate]:
             by_kind.setdefault(c.kind, []).append(c)
     return [
         Candidate(
-            kind, tuple(m.at[0] for m in members), len(members),
-            (np.hstack([m.columns[0] for m in members]),), (), members=tuple(members),
+            kind,
+            tuple(m.at[0] for m in members),
+            len(members),
+            (np.hstack([m.columns[0] for m in members]),),
+            (),
+            members=tuple(members),
         )
         for kind, members in by_kind.items()
         if len(members) >= MEMBERS_MIN
-    ] + [
-        _as_one(some)
-        for kind, members in by_kind.items() if KINDS[kind].at == "pair"
-        for some in _of_one_surface(members)
-    ]  # fmt: skip
-
-
-def _of_one_surface(pairs: Sequence[Candidate]) -> list[list[Candidate]]:
-    """Those of pairs that have a body in common, and now the same value."""
-    by: dict[tuple, list[Candidate]] = {}
-    for c in pairs:
-        now = c.to_parameters[0](np.zeros(1))
-        for body in c.at[0].split("~"):
-            by.setdefault((body, *now.values()), []).append(c)
-    some = {tuple(c.at for c in each): each for each in by.values()}
-    return [each for each in some.values() if len(each) > 1]
+    ]
 
 
 def _as_one(some: Sequence[Candidate]) -> Candidate:
