@@ -251,8 +251,8 @@ def chain_state(chain, q, v):
     velocity = V[n, 3:] + a
     _cross(a, alpha, p_WE)
     _cross(b, w, velocity)
-    bias_a[:3] = A[n, 3:] + a + b
-    bias_a[3:] = alpha
+    for k in range(3):
+        bias_a[k], bias_a[3 + k] = A[n, 3 + k] + a[k] + b[k], alpha[k]
     return ChainState(M, bias, J, bias_a, p_WE, R_WE)
 
 

@@ -15,8 +15,9 @@ def tip_pose(chain, q):
     """
     p, R, _ = tip_kinematics(chain_of(chain), q)
     pose = np.empty(7)
-    pose[:3] = p
-    pose[3:] = quaternion_of(R)
+    quaternion = quaternion_of(R)
+    for k in range(7):
+        pose[k] = p[k] if k < 3 else quaternion[k - 3]
     return pose
 
 

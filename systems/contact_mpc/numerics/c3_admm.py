@@ -92,8 +92,18 @@ def scaled_model(A, B, D, d, E, F, H, c, scale):
     n_v = n_lam + B.shape[2]
     AB, C = np.empty((K, n_x, n_v + n_x)), np.empty((K, n_lam, n_v + n_x))
     E, F, H = E / scale, F.copy(), H / scale
-    AB[:, :, :n_lam], AB[:, :, n_lam:n_v], AB[:, :, n_v:] = D * scale, B, A
-    C[:, :, :n_lam], C[:, :, n_lam:n_v], C[:, :, n_v:] = F, H, E
+    for k in range(K):  # Loops compile far faster than slices that are assigned.
+        for j in range(n_v + n_x):
+            for i in range(n_x):
+                if j < n_lam:
+                    AB[k, i, j] = D[k, i, j] * scale
+                else:
+                    AB[k, i, j] = B[k, i, j - n_lam] if j < n_v else A[k, i, j - n_v]
+            for i in range(n_lam):
+                if j < n_lam:
+                    C[k, i, j] = F[k, i, j]
+                else:
+                    C[k, i, j] = H[k, i, j - n_lam] if j < n_v else E[k, i, j - n_v]
     pushes = False
     for number in H[0].flat:
         pushes |= number != 0.0
@@ -149,9 +159,13 @@ def qp_step(model, weights, bounds, given, found):
     # eta = C [v, x] + c put in.
     K_T = max(K, len(Q))
     T, h = np.zeros((K_T, n, n)), h_plan.copy()
-    T[:, n_lam:n_v, n_lam:n_v] = R
     for k in range(K_T):
-        T[k, n_v:, n_v:] = Q[k % len(Q)]
+        for i in range(n_lam, n_v):
+            for j in range(n_lam, n_v):
+                T[k, i, j] = R[i - n_lam, j - n_lam]
+        for i in range(n_v, n):
+            for j in range(n_v, n):
+                T[k, i, j] = Q[k % len(Q), i - n_v, j - n_v]
     for i in range(n):
         at = n_x + i if i < n_v else i - n_v  # Of [v, x] in z = [x, v, eta].
         for k in range(K_T):
@@ -189,8 +203,10 @@ def qp_step(model, weights, bounds, given, found):
                 is_sure = status == CANNOT_BE_MET and not free
                 return INFEASIBLE if is_sure else NUMERICS
     for k in range(N):
-        z[k, :n_x] = x[k]
-        z[k, n_x:i_eta] = v[k]
+        for i in range(n_x):
+            z[k, i] = x[k, i]
+        for i in range(n_v):
+            z[k, n_x + i] = v[k, i]
         if plus:
             for m in range(n_lam):
                 total = c[k % K, m]

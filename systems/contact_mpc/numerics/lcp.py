@@ -279,7 +279,8 @@ def _fill(T, M, b):
     T[:] = 0.0
     for i in range(n):
         T[i, i] = 1.0
-        T[i, n : 2 * n] = -M[i]
+        for j in range(n):
+            T[i, n + j] = -M[i, j]
         T[i, 2 * n] = -1.0
         T[i, 2 * n + 1] = b[i]
 

@@ -77,11 +77,15 @@ def observe_force(observer, v_tip, a_free, mobility, gain, dt):
     """
     after = observer.copy()
     if observer[6] == 0.0:
-        after[:3], after[3:6], after[6] = v_tip, 0.0, 1.0
+        for k in range(3):
+            after[k], after[3 + k] = v_tip[k], 0.0
+        after[6] = 1.0
         return after
     pushed = gain * (v_tip - observer[:3])
-    after[:3] += dt * (a_free + pushed)
-    after[3:6] = np.linalg.solve(mobility, pushed)
+    force = np.linalg.solve(mobility, pushed)
+    for k in range(3):
+        after[k] += dt * (a_free[k] + pushed[k])
+        after[3 + k] = force[k]
     return after
 
 
@@ -109,7 +113,8 @@ def estimate(
     """
     n = window.size // 3
     after, forces = window.copy(), np.empty(3 * n)
-    forces[:-3], forces[-3:] = with_force[3:], np.nan
+    for i in range(3 * n):
+        forces[i] = with_force[i + 3] if i < 3 * n - 3 else np.nan
     numbers = q.sum() + v.sum() + p_ball.sum() + v_ball.sum()
     turns = q_object.size > 0
     if turns:
@@ -129,11 +134,13 @@ def estimate(
         observed = observer.copy()
         observed[6] = 0.0
         return x_now, after, observed, forces, valid
-    after[: 3 * n - 3] = window[3 : 3 * n]
-    after[3 * n - 3 : 3 * n] = u
+    for i in range(3 * n):
+        after[i] = window[i + 3] if i < 3 * n - 3 else u[i + 3 - 3 * n]
     after[3 * n] = min(valid * (window[3 * n] + 1.0), n)
     mobility = tip_mobility(state)
     if window[3 * n] > 0.0:  # The last reading was good, too.
-        forces[-3:] = input_with_force(u, x[V_TIP], v_tip, mobility, tip_mass, dt)
+        felt_u = input_with_force(u, x[V_TIP], v_tip, mobility, tip_mass, dt)
+        for k in range(3):
+            forces[3 * n - 3 + k] = felt_u[k]
     observed = observe_force(observer, v_tip, u / tip_mass, mobility, gain, dt)
     return x_now, after, observed, forces, valid
