@@ -291,6 +291,26 @@ def test_what_others_stand_in_for_is_named_where_it_moves_windows(alone, kept):
     assert [c.effect.at[0] for c in left.choices] == [*kept]
 
 
+def test_where_no_window_can_be_simulated_without_an_effect_all_others_stay():
+    """Of two effects that move windows as little."""
+
+    class Stops(Held):
+        def outcome(self, effects, start, end, nuisances, recordings=None, jobs=1):
+            there = [e.at[0] for e in effects]
+            fitted = there == [e.at[0] for e in end.effects]
+            after = np.nan if fitted and there == [JOINTS[0]] else 1.0
+            per = {"arm.j1.position": {"before": 1.2, "after": after}}
+            return Outcome(GapMeasure(1.2, after, 1.0, 0.3, per))
+
+    problem = Stops({"arm.j1": (1.2, 1.0), "arm.j2": (1.2, 1.0)})
+    selection = selection_of(problem, JOINTS[:2])
+    alone = tuple(replace(c, in_group=False) for c in selection.choices)
+    selection = replace(selection, choices=alone)
+    outcome = problem.outcome(selection.effects(), None, selection.end, None)
+    left, *_ = above_step(problem, selection, outcome, {"arm.j1.position": 3.0}, 1)
+    assert left is selection
+
+
 def test_where_no_window_can_be_simulated_with_an_effect_the_step_says_nothing():
     problem = Held({"arm.j1": (3.0, 1.0)})
     selection = selection_of(problem, JOINTS[:1])

@@ -69,14 +69,21 @@ def test_pairs_of_one_surface_may_have_one_friction():
     than half of it."""
     now = {"w.box~w.floor": 0.4, "w.box~w.rod": 0.4, "w.can~w.floor": 0.7}
 
+    def now_of(kind, at):
+        if at[0] not in now:
+            raise ValueError("nothing there has a friction")
+        return {"friction": now[at[0]]}
+
     def residual(effects):
         (effect,) = effects
         held = len(effect.at) < 2 or effect.parameters["friction"] > 0.2
         return np.ones(6) if held else np.zeros(6)
 
     model = SimpleNamespace(
-        places_of=lambda kind: list(now) if kind == "contact_friction" else [],
-        dynamics=SimpleNamespace(now=lambda kind, at: {"friction": now[at[0]]}),
+        places_of=lambda kind: (
+            [*now, "w.box~w.ghost"] if kind == "contact_friction" else []
+        ),
+        dynamics=SimpleNamespace(now=now_of),
         residual=residual,
     )
     (shared,) = _of_surfaces(model, [], np.ones(6))

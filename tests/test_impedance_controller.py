@@ -462,7 +462,8 @@ def test_without_any_good_reference_the_arm_stays(law, chain):
 
 
 @pytest.mark.parametrize(  # A wrench may be negative.
-    "port, value", [(0, np.nan), (0, -1.0), (1, np.nan), (1, -1.0), (2, np.nan)]
+    "port, value",
+    [(port, x) for port in range(3) for x in (np.nan, np.inf)] + [(0, -1.0), (1, -1.0)],
 )
 def test_bad_gains_and_wrench_fall_back_and_are_said(law, chain, port, value):
     state = (law.q_nominal, np.zeros(7), reference([0.5, 0.0, 0.101]))

@@ -127,8 +127,11 @@ def _of_surfaces(model, there: Sequence[Effect], r: np.ndarray) -> list[Candidat
     taken = {(e.kind, at) for e in there for at in e.at}
     for kind in (k for k in _TIMES if KINDS[k].at == "pair"):
         for at in model.places_of(kind):
-            ((name, value),) = model.dynamics.now(kind, [at]).items()
-            for body in at.split("~") if value and (kind, at) not in taken else ():
+            now = _now(model, kind, at)
+            if now is None or (kind, at) in taken:
+                continue
+            ((name, value),) = now.items()
+            for body in at.split("~") if value else ():
                 by.setdefault((kind, name, value, body), []).append(at)
     found = {}
     for (kind, name, value, _), some in by.items():
@@ -150,12 +153,19 @@ def _met_axes(model: FreeBodyModel | WindowModel, at: str) -> dict[str, float]:
     return {axis: off for (name, axis), off in model.met.items() if name == at}
 
 
+def _now(model, kind: str, at: str) -> dict[str, float] | None:
+    """What a kind changes, as it is; None where the place has no such thing."""
+    try:
+        return dict(model.dynamics.now(kind, [at]))
+    except ValueError:
+        return None
+
+
 def _trials(model, kind: str, at: str):
     """Of each candidate of a kind at a place: alternatives, each a list of (step,
     parameters), one for each unknown; the unknowns; and what stays as it is."""
-    try:
-        now = dict(model.dynamics.now(kind, [at]))
-    except ValueError:
+    now = _now(model, kind, at)
+    if now is None:
         return
     if kind == "object_size":
         name = "radius" if "radius" in now else "scale"

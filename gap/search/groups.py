@@ -42,16 +42,12 @@ def groups_of(found: Sequence[Candidate]) -> list[Candidate]:
             by_kind.setdefault(c.kind, []).append(c)
     return [
         Candidate(
-            kind,
-            tuple(m.at[0] for m in members),
-            len(members),
-            (np.hstack([m.columns[0] for m in members]),),
-            (),
-            members=tuple(members),
+            kind, tuple(m.at[0] for m in members), len(members),
+            (np.hstack([m.columns[0] for m in members]),), (), members=tuple(members),
         )
         for kind, members in by_kind.items()
         if len(members) >= MEMBERS_MIN
-    ]
+    ]  # fmt: skip
 
 
 def _as_one(some: Sequence[Candidate]) -> Candidate:

@@ -326,9 +326,10 @@ class ParameterLearner(LeafSystem):
         )  # fmt: skip
         found = explain(lcs, sample, loss)
         if found is not None and found.lam.any():
-            acts = acting(lcs, sample, friction, c.slip_noise, high, found.lam)
-            loss = replace(loss, acting=acts)
-            found = explain(lcs, sample, loss) or found
+            if np.any(high != 1.0):  # Else no force tilts a normal.
+                acts = acting(lcs, sample, friction, c.slip_noise, high, found.lam)
+                loss = replace(loss, acting=acts)
+                found = explain(lcs, sample, loss) or found
             # Forces may act at the step's end instead of its beginning.
             before, after = (
                 pushes(model.build(x, sample.u, parameters=values))[0]
@@ -351,10 +352,12 @@ class ParameterLearner(LeafSystem):
         surface whose gap is not known is as far from where the model has it along
         itself, too, and at a corner or on a ball the normal is then another one."""
         model, found = self.model, np.zeros_like(sample.M)
-        off, contact = model.of_rows(lcs, self._gap_std), pushes(lcs)[2]
+        off, (J, _, contact) = model.of_rows(lcs, self._gap_std), pushes(lcs)
+        n_of_rows = normals(lcs)
         for one in np.unique(contact[(off > 0.0) & (lam > 0.0)]):
             mine = contact == one
-            T, n = tangents(lcs, friction, mine, high[mine][0]), normals(lcs)[mine][0]
+            T = tangents(J - n_of_rows, friction, mine, high[mine][0])
+            n = n_of_rows[mine][0]
             force = tangent_edges(friction, mine, high[mine][0]).T @ lam[mine]
             ways = np.linalg.solve(sample.M, T.T).T
             reach = np.maximum((T * ways).sum(axis=1), 1e-300)

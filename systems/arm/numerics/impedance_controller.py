@@ -39,6 +39,7 @@ from makebreak.systems.arm.numerics.serial_chain import (
     chain_state,
     tip_kinematics,
 )
+from makebreak.systems.numerics.few_numbers import all_finite, dot
 from makebreak.systems.numerics.joint_laws import N_NUMBERS, JointLaws
 
 # Status bits.
@@ -117,26 +118,11 @@ class Law(NamedTuple):
     laws: JointLaws  # Forces in the joints, as of joint_friction.to_compensate.
 
 
-# A slice that is assigned, or a sum of products of slices, takes three times as long to
-# compile as a call.
+# A slice that is assigned takes three times as long to compile as a call.
 @numba.njit(cache=True)
 def _copy(out, values):
     for k in range(out.size):
         out[k] = values[k]
-
-
-@numba.njit(cache=True)
-def _dot3(a, b):
-    """Of the first three entries."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@numba.njit(cache=True)
-def _is_finite(values):
-    for value in values:
-        if not np.isfinite(value):
-            return False
-    return True
 
 
 @numba.njit(cache=True)
@@ -316,11 +302,11 @@ def force_control(law, slots, directions, targets, measured):
     slots[:, ACTIVE] = 0.0
     for k in range(2):
         n = rows[k]
-        if _dot3(n, n) == 0.0:
+        if dot(n, n) == 0.0:
             continue
         best, best_cosine = -1, SAME_DIRECTION
         for j in range(N_SLOTS):
-            cosine = _dot3(slots[j], n)
+            cosine = dot(slots[j], n)
             free = slots[j, WEIGHT] > 0.0 and slots[j, ACTIVE] == 0.0
             if free and cosine > best_cosine:
                 best, best_cosine = j, cosine
@@ -338,7 +324,7 @@ def force_control(law, slots, directions, targets, measured):
         step = max(target, slot[LEVEL]) * law.period / force.ramp_sec
         slot[LEVEL] += min(max(target - slot[LEVEL], -step), step)
         slot[DAMPING] = max(target / force.closing_speed, force.normal_damping)
-        felt = -_dot3(n, measured) if sensed else 0.0
+        felt = -dot(n, measured) if sensed else 0.0
         gain, missing = 0.0, 0.0
         if felt >= CONTACT_FORCE_MIN:
             gain, missing = force.integral_gain, slot[LEVEL] - felt
@@ -372,7 +358,7 @@ def _under_motion_control(slots, scale, motion):
     for j in range(slots.shape[0]):
         if slots[j, WEIGHT] > 0.0:
             n_j = slots[j, :3]
-            less = (1.0 - np.sqrt(1.0 - slots[j, WEIGHT])) * _dot3(n_j, out)
+            less = (1.0 - np.sqrt(1.0 - slots[j, WEIGHT])) * dot(n_j, out)
             for k in range(3):
                 out[k] -= less * n_j[k]
     return out
@@ -443,7 +429,7 @@ def impedance_torque(
     stiffness = paid_stiffness(tank, stiffness, stored, law.tank)
     lost = _under_motion_control(slots, scale, rate)
     F = stiffness[:m] * error + damping[:m] * rate
-    pushing = np.sqrt(_dot3(F, F))
+    pushing = np.sqrt(dot(F, F))
     if pushing > law.force_max:
         for k in range(3):
             F[k] *= law.force_max / pushing
@@ -455,13 +441,13 @@ def impedance_torque(
         weight = slots[j, WEIGHT]
         if weight > 0.0:  # Motion control only across n; along n the push.
             n_j = slots[j, :3]
-            v_n = _dot3(n_j, twist)
+            v_n = dot(n_j, twist)
             slots[j, SPEED] = v_n + law.force.speed_keep * (slots[j, SPEED] - v_n)
             push = max(slots[j, LEVEL] + slots[j, INTEGRAL], 0.0)
             push -= slots[j, DAMPING] * slots[j, SPEED]
-            more = weight * (push - _dot3(n_j, F))
-            a_along = weight * _dot3(n_j, a_ref)
-            v_along = weight * _dot3(n_j, moves)
+            more = weight * (push - dot(n_j, F))
+            a_along = weight * dot(n_j, a_ref)
+            v_along = weight * dot(n_j, moves)
             for k in range(3):
                 F[k] += more * n_j[k]
                 a_ref[k] -= a_along * n_j[k]
@@ -543,7 +529,7 @@ def tick(
     status = 0
     count = memory[2 * n + 7]
     has_pose, has_q = memory[2 * n + 8] > 0.0, memory[2 * n + 9] > 0.0
-    sensed = _is_finite(q) and _is_finite(v)
+    sensed = all_finite(q) and all_finite(v)
     if sensed:
         if not has_q:
             _copy(memory[:n], q)
@@ -563,13 +549,13 @@ def tick(
     x_d, R_d, held = _reference(chain, memory, q_now, x_d, has_pose, n)
     if held:
         status |= REFERENCE_HELD
-    if not (_is_finite(stiffness) and np.all(stiffness >= 0.0)):
+    if not (all_finite(stiffness) and np.all(stiffness >= 0.0)):
         stiffness = law.stiffness.copy()
         status |= REFERENCE_HELD
-    if not (_is_finite(damping) and np.all(damping >= 0.0)):
+    if not (all_finite(damping) and np.all(damping >= 0.0)):
         damping = law.stiffness.copy() if ratio > 0.0 else law.damping.copy()
         status |= REFERENCE_HELD
-    if not _is_finite(wrench):
+    if not all_finite(wrench):
         wrench = np.zeros(6)
         status |= REFERENCE_HELD
     if not 0.0 <= delay < np.inf:  # With NaN the brakes would do nothing.
@@ -577,12 +563,12 @@ def tick(
         status |= REFERENCE_HELD
 
     kept = memory[2 * n + 10 : 2 * n + 18]
-    if _is_finite(directions) and _is_finite(targets):
+    if all_finite(directions) and all_finite(targets):
         _copy(kept[:6], directions)
         _copy(kept[6:], targets)
     else:
         status |= REFERENCE_HELD
-    if not _is_finite(measured):
+    if not all_finite(measured):
         measured = np.zeros(0)
         status |= FORCE_SENSOR_HELD
     slots = memory[2 * n + 18 : -n - N_TANK].reshape(N_SLOTS, SLOT)
@@ -610,7 +596,7 @@ def tick(
     else:  # Carry the arm and slow it down: qdd = -HOLD_DAMPING v.
         now = chain_state(chain, q_now, v_now)
         asked = now.bias - chain.damping * v_now - HOLD_DAMPING * (now.M @ v_now)
-    if not _is_finite(asked):  # Overflow.
+    if not all_finite(asked):  # Overflow.
         asked = chain_state(chain, q_now, np.zeros(n)).bias
         status |= REFERENCE_HELD
     memory[2 * n + 7] = (count + 1) % law.posture_every
@@ -619,7 +605,7 @@ def tick(
     if not is_free(law, q_now, v_now):
         now = chain_state(chain, q_now, v_now)
         kept, by = braked(law, tau, out, q_now, v_now, now.M, now.bias, delay)
-        if _is_finite(kept):  # Else an overflow.
+        if all_finite(kept):  # Else an overflow.
             out, limited = kept, limited | by
     _copy(tau, out)
     return status | limited
@@ -629,7 +615,7 @@ def tick(
 def _reference(chain, memory, q, x_d, has_pose, n):
     """x_d, its rotation, and whether it was replaced by the last good pose."""
     square = np.sum(x_d[3:7] ** 2)
-    if _is_finite(x_d) and 0.25 < square < 4.0:
+    if all_finite(x_d) and 0.25 < square < 4.0:
         _copy(memory[2 * n : 2 * n + 7], x_d[:7])
         memory[2 * n + 8] = 1.0
         return x_d, rotation_of(x_d[3:7]), False

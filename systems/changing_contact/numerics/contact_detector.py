@@ -49,6 +49,7 @@ from makebreak.systems.changing_contact.numerics.contact_task import (
     STATUS,
     TIME,
 )
+from makebreak.systems.numerics.few_numbers import dot
 
 CUTOFF_HZ = 100.0  # Of the first-order filters of force and velocity.
 CUTOFF_ACCELERATION_HZ = 30.0
@@ -159,11 +160,6 @@ def new_memory(tared: bool = False) -> np.ndarray:
 
 
 @numba.njit(cache=True)
-def _dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@numba.njit(cache=True)
 def _ticks_of(seconds, period):
     return max(1.0, np.floor(seconds / period + 0.5))
 
@@ -258,7 +254,7 @@ def _losses(limits, m, contact, n):
         if np.sum(row**2) < 0.25:
             m.held[i] = m.lost[i] = m.armed[i] = 0.0
             continue
-        normal = -_dot(m.force, row)
+        normal = -dot(m.force, row)
         total += max(normal, 0.0)
         m.held[i] = m.held[i] + 1.0 if normal > 1.5 * limits.loss_force else 0.0
         if m.held[i] >= held_ticks:
@@ -392,7 +388,7 @@ def detect(limits, memory, contact, time, wrench, pose, velocity, d, n, phase):
     total = _losses(limits, m, contact, n)
 
     # A new direction or a new set of surfaces: friction is learned anew.
-    turned = not moving or _dot(m.d, d) < 0.9
+    turned = not moving or dot(m.d, d) < 0.9
     other = phase[PHASE_SEGMENT] != m.segment
     for i in range(6):
         other = other or abs(n[i] - m.n[i]) > 0.5
@@ -406,11 +402,11 @@ def detect(limits, memory, contact, time, wrench, pose, velocity, d, n, phase):
         m.learned = m.over = m.under = m.pending = 0.0
         m.offset = 0.0
 
-    speed = _dot(m.velocity, d)
+    speed = dot(m.velocity, d)
     way_speed = np.sqrt(m.velocity[0] ** 2 + m.velocity[1] ** 2 + m.velocity[2] ** 2)
     cosine = speed / way_speed if way_speed > 1e-9 else 0.0
-    f_raw = -_dot(m.force, d)
-    f = f_raw - limits.tool_mass * _dot(m.acceleration, d)
+    f_raw = -dot(m.force, d)
+    f = f_raw - limits.tool_mass * dot(m.acceleration, d)
     predicted = m.mu * total if in_contact else m.offset
     innovation = f - predicted
     m.along[0], m.along[1] = f, predicted
@@ -421,10 +417,10 @@ def detect(limits, memory, contact, time, wrench, pose, velocity, d, n, phase):
     sample.innovation, sample.speed, sample.force = innovation, speed, f_raw
 
     if m.peak_left > 0.0:
-        m.peak = max(m.peak, -_dot(m.force_100, m.peak_d))
+        m.peak = max(m.peak, -dot(m.force_100, m.peak_d))
         m.peak_left -= 1.0
         # At rest it is as deep in as the impact brings it. What comes then is the push.
-        if _dot(m.velocity, m.peak_d) <= 0.0:
+        if dot(m.velocity, m.peak_d) <= 0.0:
             m.peak_left = min(m.peak_left, REST_TICKS)
         if m.peak_left <= 0.0:
             contact[MEASURED] += 1.0
@@ -444,7 +440,7 @@ def detect(limits, memory, contact, time, wrench, pose, velocity, d, n, phase):
     elif m.pending > 0.0:
         _add(limits, m, innovation, speed)
         m.pending += 1.0
-        m.highest = max(m.highest, -_dot(m.force_100, d))
+        m.highest = max(m.highest, -dot(m.force_100, d))
         if k >= 20:
             m.earlier = m.ring[(k - 20) % RING].innovation
         learning = in_contact and m.learned * limits.period < LEARN_SEC
@@ -471,7 +467,7 @@ def detect(limits, memory, contact, time, wrench, pose, velocity, d, n, phase):
             _begin(limits, m)
             if m.before_speed < limits.speed_min:  # It crept, or was stopped.
                 if f > limits.friction_max * total + 2.0 * limits.impact_force:
-                    m.highest = -_dot(m.force_100, d)
+                    m.highest = -dot(m.force_100, d)
                     _report(limits, m, contact, d)
                 m.pending = 0.0
         elif sliding:
@@ -497,7 +493,7 @@ def _report(limits, m, contact, d):
     m.pending = m.over = 0.0
     m.learned = 0.0
     m.quiet = _ticks_of(SAME_SEC, limits.period)
-    m.touched = _dot(m.first_position, d)
+    m.touched = dot(m.first_position, d)
 
 
 def warm_up(limits: Thresholds) -> None:

@@ -30,14 +30,13 @@ from makebreak.systems.changing_contact.numerics.path_geometry import (
     LENGTH,
     LINE,
     add_along,
-    all_finite,
-    dot,
     head,
     last_parameter,
     length_to,
     path_point,
     place,
 )
+from makebreak.systems.numerics.few_numbers import all_finite, dot
 
 REGIONS_MAX = 32
 REGION_ROW = np.dtype(  # entry, leave: arc lengths [m]; speed inside [m/s].

@@ -34,21 +34,6 @@ _NODES = _NODES + 0.5
 
 
 @numba.njit(cache=True)
-def dot(a, b):
-    """Of the first three entries; np.sum(a * b) takes a second to compile."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@numba.njit(cache=True)
-def all_finite(a):
-    """Whether every number of a is finite; np.all takes long to compile."""
-    for x in a:
-        if not np.isfinite(x):
-            return False
-    return True
-
-
-@numba.njit(cache=True)
 def add_along(C, n, distance):
     """C += n distance in place, in the first three entries."""
     for i in range(3):

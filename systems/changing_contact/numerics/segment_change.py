@@ -19,8 +19,6 @@ from makebreak.systems.changing_contact.numerics.path_geometry import (
     LENGTH,
     N_FORCE,
     add_along,
-    all_finite,
-    dot,
     force_direction,
     head,
     path_point,
@@ -37,6 +35,7 @@ from makebreak.systems.changing_contact.numerics.speed_track import (
     start_track,
     steady_from,
 )
+from makebreak.systems.numerics.few_numbers import all_finite, dot
 
 # Cosines of two directions that are one, and of a contact that is ahead.
 SAME_DIRECTION, AHEAD = 1.0 - 1e-6, 0.5

@@ -5,13 +5,13 @@ import numba
 import numpy as np
 
 from makebreak.systems.changing_contact.numerics.path_geometry import (
-    dot,
     path_point,
     rotation_motion,
 )
 from makebreak.systems.changing_contact.numerics.shaper_memory import FADES
 from makebreak.systems.changing_contact.numerics.speed_track import motion_at
 from makebreak.systems.changing_contact.numerics.velocity_profile import unit_step
+from makebreak.systems.numerics.few_numbers import dot
 
 BEND_MAX = 9.85  # Largest value of S''.
 TURN_BACK_SEC = 1.0  # Fading time of an orientation where positions stay shifted [s].

@@ -11,8 +11,8 @@ import numba
 import numpy as np
 
 from makebreak.systems.changing_contact.numerics.contact_task import BROKEN, MADE
-from makebreak.systems.changing_contact.numerics.path_geometry import all_finite
 from makebreak.systems.changing_contact.numerics.speed_track import TRACK, start_track
+from makebreak.systems.numerics.few_numbers import all_finite
 
 
 class ShaperLaw(NamedTuple):

@@ -62,8 +62,6 @@ from makebreak.systems.changing_contact.numerics.path_geometry import (
     START,
     TARGETS,
     add_along,
-    all_finite,
-    dot,
     force_direction,
     head,
     path_point,
@@ -92,6 +90,7 @@ from makebreak.systems.changing_contact.numerics.speed_track import (
     start_track,
 )
 from makebreak.systems.changing_contact.numerics.velocity_profile import unit_step
+from makebreak.systems.numerics.few_numbers import all_finite, dot
 
 BAD_SEC = 0.1  # Length of a pause after the last bad sample [s].
 LOOKED_AT = 256  # Points of a path among which the nearest is looked for.

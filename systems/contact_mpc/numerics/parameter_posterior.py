@@ -166,6 +166,7 @@ def acting(
         lam (n_lam,) says how large they are; None: none.
     """
     J, _, contact = pushes(lcs)
+    along = J - normals(lcs)
     n_v, n = sample.v_mean.size, len(J)
     v_ends = np.stack([sample.x_now[-n_v:], sample.x_next[-n_v:]])
     parts, slides = [np.zeros((4, n, 0))], np.zeros(n, bool)
@@ -174,7 +175,7 @@ def acting(
         k, ratio = int(mine.sum()), 1.0 if high is None else high[mine][0]
         edges = friction_edges(max(k // 2, 1))[:k]
         axes, tilted = np.linalg.pinv(edges), 1.0
-        now, after = v_ends @ tangents(lcs, friction, mine, ratio).T
+        now, after = v_ends @ tangents(along, friction, mine, ratio).T
         slip, change = 0.5 * (now + after), after - now
         error, spread = noise**2, np.zeros(1)
         if ratio != 1.0:
@@ -290,10 +291,12 @@ def tangent_edges(friction, mine, high=1.0) -> np.ndarray:
     return friction[mine][:, None] * friction_edges(max(k // 2, 1))[:k] * [high, 1.0]
 
 
-def tangents(lcs: LCS, friction, mine, high=1.0) -> np.ndarray:
-    """(2, n_v) what moves a contact along its two tangents: as of tangent_edges."""
-    along = (pushes(lcs)[0] - normals(lcs))[mine]
-    return np.linalg.pinv(tangent_edges(friction, mine, high)) @ along
+def tangents(along, friction, mine, high=1.0) -> np.ndarray:
+    """(2, n_v) what moves a contact along its two tangents: as of tangent_edges.
+
+    Args: along (n_lam, n_v): what rows push along, less their normals.
+    """
+    return np.linalg.pinv(tangent_edges(friction, mine, high)) @ along[mine]
 
 
 def nearest(lcs: LCS, sample: Sample) -> np.ndarray:
