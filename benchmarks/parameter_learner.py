@@ -13,7 +13,7 @@ their 90 % intervals hold the truth. The world is Drake at 1 ms steps.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from pydrake.multibody.parsing import Parser
@@ -56,7 +56,8 @@ class Task:
         values: the model's. learned: the parameter of each.
         q: positions at the start; x_desired, Q, R, N, dt, u_max: of the planner.
         goal: index of the position whose final error counts, in `unit`s of 1e-3.
-        careful: indices of the positions that are approached with care; empty: none.
+        careful: positions that are approached with care. The door, which coasts far,
+            stops short by a 90 % interval.
     """
 
     name: str
@@ -74,7 +75,7 @@ class Task:
     dt: float = 0.05
     u_max: float = np.inf
     seconds: float = 4.0
-    careful: Sequence[int] = ()
+    careful: CarefulGoalConfig = field(default_factory=CarefulGoalConfig)
     dry: str = ""  # Joint that has the value `coulomb` as its dry friction.
 
 
@@ -136,7 +137,8 @@ DOOR = Task(
     {"mass": 2.0, "damping": 0.8, "friction": 0.4, "gap": 0.0},
     of_hinged("door"),
     [1.0, -2.0, 0.0], [0.4, -0.2, -0.5, 0.0, 0.0, 0.0],
-    [0.0, 0.0, 300.0, 5.0, 5.0, 10.0], [0.02] * 2, 2, "mrad", N=20, careful=[2],
+    [0.0, 0.0, 300.0, 5.0, 5.0, 10.0], [0.02] * 2, 2, "mrad", N=20,
+    careful=CarefulGoalConfig([2], NINETY),
 )  # fmt: skip
 
 
@@ -158,7 +160,7 @@ DRAWER = Task(
         "gap": Parameter("gap", 0.003, pairs=[0]),
     },
     [0.0, 0.0], [0.3, 0.3, 0.0, 0.0], [0.0, 300.0, 1.0, 5.0], [0.01], 1, "mm", N=15,
-    careful=[1], dry="drawer_joint",
+    careful=CarefulGoalConfig([1]), dry="drawer_joint",
 )  # fmt: skip
 
 
@@ -239,7 +241,8 @@ BOX = Task(
     [-0.07, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0251],
     [0.14, 0.0, 1.0, 0.0, 0.0, 0.0, 0.2, 0.0, 0.0251, *[0.0] * 8],
     [0.0, 0.0, *[0.0] * 4, 500.0, 500.0, 0.0, 1.0, 1.0, *[0.0] * 3, 5.0, 5.0, 0.0],
-    [0.01] * 2, 6, "mm", N=10, careful=[6, 7],
+    [0.01] * 2, 6, "mm", N=10,
+    careful=CarefulGoalConfig([6, 7]),
 )  # fmt: skip
 TASKS = {task.name: task for task in (DOOR, DRAWER, LID, LEG, BOX)}
 
@@ -274,7 +277,7 @@ def run(task: Task, true: dict, knows: bool, learns: bool, careful=False) -> Run
         pairs, list(task.Q), list(task.R), list(task.x_desired), task.dt, task.dt,
         C3Options(N=task.N, rounds=5, polish=3), C3Bounds(-limit, limit),
         parameters=items,
-        careful=CarefulGoalConfig(list(task.careful) if careful else []),
+        careful=task.careful if careful else CarefulGoalConfig(),
     )  # fmt: skip
     mpc = builder.AddSystem(make_contact_mpc(model, config))
     state = plant.get_state_output_port()
