@@ -159,7 +159,7 @@ class Gantry:
         return force
 
 
-@pytest.mark.parametrize("target", [3.0, 12.0])
+@pytest.mark.parametrize("target", [pytest.param(3.0, marks=pytest.mark.slow), 12.0])
 def test_a_gantry_of_damped_rails_presses_with_the_force_asked_for(target):
     config = ImpedanceConfig(stiffness=[500.0] * 3 + [0.0] * 3)
     loop = Gantry(config, HybridConfig(damping_ratio=0.9), gap=0.001)

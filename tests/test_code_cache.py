@@ -193,3 +193,14 @@ def test_an_array_of_another_shape_is_refused_by_compiled_code():
     np.testing.assert_array_equal(head(np.zeros(3), np.ones(2)), [1.0, 1.0, 0.0])
     with pytest.raises(ValueError, match="slice of another shape"):
         head(np.zeros(3), np.ones(3))
+
+
+@pytest.mark.parametrize(("module", "made"), [("makebreak.f", False), ("own", True)])
+def test_only_what_others_compile_gets_a_wrapper_for_c(module, made):
+    names = {"__name__": module}
+    exec("def f(x):\n    return x + 1.0", names)
+    f = numba.njit(names["f"])
+    assert f(1.0) == 2.0
+    (compiled,) = f.overloads.values()
+    name = compiled.fndesc.llvm_cfunc_wrapper_name
+    assert (name in compiled.library.get_llvm_str()) == made

@@ -182,10 +182,10 @@ def random_impacts(rng, count, free):
 
 
 @pytest.mark.parametrize("free", [True, False])
-def test_hundreds_of_impacts_are_each_felt_once_at_their_place(free):
+def test_many_impacts_are_each_felt_once_at_their_place(free):
     rng = np.random.default_rng(1)
     place, late, speed, error = [], [], [], []
-    for world in random_impacts(rng, 100, free):
+    for world in random_impacts(rng, 60, free):
         rows, touch = run(world), world.touch()
         assert rows[touch - 1, MADE] == 0
         assert rows[-1, MADE] == 1 and rows[-1, MEASURED] == 1
@@ -208,7 +208,7 @@ def test_hundreds_of_impacts_are_each_felt_once_at_their_place(free):
 def test_friction_never_counts_as_an_impact():
     # Steps, ramps of 5 to 30 mm and reversals, friction 0.1 to 0.6, at 30 to 250 mm/s.
     rng = np.random.default_rng(0)
-    for k in range(120):
+    for k in range(60):
         speed = np.exp(rng.uniform(np.log(0.03), np.log(0.25)))
         a, b = (0.1, 0.6) if k % 4 == 0 else rng.uniform(0.1, 0.6, 2)
         width = (1e-5, 1e-5, rng.uniform(0.005, 0.03))[k % 3]

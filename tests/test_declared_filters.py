@@ -191,7 +191,7 @@ def second_order(hz):
 @pytest.mark.parametrize(
     "low_pass, declared",
     [
-        (first_order(40.0), "first order, 40 Hz"),
+        pytest.param(first_order(40.0), "first order, 40 Hz", marks=pytest.mark.slow),
         (second_order(20.0), "Butterworth of order 2, 20 Hz"),
     ],
     ids=["first order", "Butterworth"],

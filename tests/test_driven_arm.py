@@ -99,7 +99,7 @@ LACKS = {
 }  # fmt: skip
 
 
-def commands(joints, seconds=1.0, rate=50.0):
+def commands(joints, seconds=0.5, rate=50.0):
     time = np.arange(0.0, seconds, 1.0 / rate)
     columns = {
         f"{joint}.position_command": 0.3 * np.sin((3.0 + k) * time + k)
@@ -124,7 +124,7 @@ def test_a_tree_of_joints_moves_as_in_drake(tmp_path, lacks, monkeypatch):
     fast.tol = 1e-5
     want = exact.run(start, time, channels, told)
     have = fast.run(start, time, channels, told)
-    # A tolerance of 1e-5 rad/s and 1e-7 rad a step, of which there are a thousand.
+    # A tolerance of 1e-5 rad/s and 1e-7 rad a step, of which there are 500.
     np.testing.assert_allclose(have[:, :4], want[:, :4], atol=5e-5)
     np.testing.assert_allclose(have[:, 4:], want[:, 4:], atol=2e-3)
     assert np.abs(want[:, :4] - want[0, :4]).max(axis=0).min() > 0.02  # It does move.

@@ -138,10 +138,10 @@ def reference(p=START, v=(0, 0, 0), a=(0, 0, 0)):
 def pressing(plant, target=6.0, **options):
     """The sphere, brought to just above the table, presses on it."""
     loop = Loop(plant, **options)
-    for z in np.linspace(START[2], 0.0202, 60):
+    for z in np.linspace(START[2], 0.0202, 30):
         loop.set(x_desired=reference([*START[:2], z]))
         loop.run(0.02)
-    loop.run(0.5)
+    loop.run(0.3)
     assert np.all(loop.force() == 0.0)
     loop.press(DOWN, target)
     return loop
@@ -184,7 +184,7 @@ def test_a_tip_that_is_lifted_off_comes_back_in_a_known_time(plant):
     lift, target = 8.0, 6.0  # More than F_c: the push alone never comes back.
     loop.set(wrench_feedforward=[0.0, 0.0, lift, 0.0, 0.0, 0.0])
     pressed = []
-    for _ in range(3000):
+    for _ in range(1600):
         loop.run(0.001)
         pressed.append(loop.force()[2] > 0.0)
     pressed = np.array(pressed)

@@ -99,7 +99,11 @@ QUICK = [c for c in cases() if c.name.split("_", 1)[1] in (
     "pendulum_joint_coulomb_friction", "sledge_plane_tilt")]  # fmt: skip
 
 
-@pytest.fixture(scope="module", params=QUICK, ids=lambda c: c.name)
+@pytest.fixture(
+    scope="module",
+    params=[QUICK[0], *(pytest.param(c, marks=pytest.mark.slow) for c in QUICK[1:])],
+    ids=lambda c: c.name,
+)
 def quick(request):
     return request.param, make(request.param)
 

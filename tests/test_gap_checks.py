@@ -68,7 +68,9 @@ def one(found, kind):
     return of_kind[0]
 
 
-@pytest.mark.parametrize("block", range(5))
+@pytest.mark.parametrize(
+    "block", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in range(1, 5))]
+)
 def test_clean_recordings_of_100_seeds_raise_no_finding(tmp_path, block):
     facts = SceneFacts({f"arm.j{j}": JointFacts(False, -4, 4, 60) for j in range(2)})
     for seed in range(20 * block, 20 * block + 20):
@@ -126,8 +128,8 @@ def rotation(q):
     return np.array(R).transpose(2, 0, 1)
 
 
-def test_clean_flights_of_20_seeds_raise_no_finding(tmp_path):
-    for seed in range(20):
+def test_clean_flights_of_10_seeds_raise_no_finding(tmp_path):
+    for seed in range(10):
         assert findings(tmp_path, falling(seed)) == []
 
 

@@ -98,7 +98,11 @@ def test_a_set_can_be_drawn_anew_from_another_seed():
     assert [c.seed for c in one_by_one("standard", 7)][:2] == [7, 8]
 
 
-@pytest.mark.parametrize("world", sorted(WORLDS))
+@pytest.mark.parametrize(
+    "world",
+    [pytest.param(w, marks=[pytest.mark.slow] * (w in ("drake_damped", "drake_lagged")))
+     for w in sorted(WORLDS)],
+)  # fmt: skip
 def test_a_block_slides_as_far_as_friction_says(world):
     far, _ = slid(world, 0.3)
     assert far == pytest.approx(0.4**2 / (2.0 * 0.3 * G), rel=0.02)

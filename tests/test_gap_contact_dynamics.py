@@ -48,7 +48,7 @@ from makebreak.models.scene import read_scene
 PAIR = f"{BLOCK}~{TABLE}"
 
 
-def pushed(folder, seed, kinds, sign=None, episodes=5, **how):
+def pushed(folder, seed, kinds, sign=None, episodes=3, **how):
     """The scene, recordings and truth of a few pushes."""
     rng = np.random.default_rng(seed)
     world = push_world.a_world(rng)

@@ -92,7 +92,6 @@ def rms(r):
 
 
 QUICK = (
-    ("servo", "nothing"),
     ("servo", "load and more"),
     ("velocity", "load and more"),
 )

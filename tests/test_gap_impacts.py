@@ -178,7 +178,7 @@ def test_velocities_that_come_late_are_no_softer_wall(tmp_path):
         pytest.param(2, 0, marks=pytest.mark.slow),
         pytest.param(4, 0, marks=pytest.mark.slow),
         (2, 2),
-        (1, 0),
+        pytest.param(1, 0, marks=pytest.mark.slow),
         pytest.param(2, 5, marks=pytest.mark.slow),
     ],
 )

@@ -28,7 +28,7 @@ def found_in(folder, recipe, seed):
 @pytest.mark.parametrize(
     "robot, option",
     [
-        ("planar", "first order"),
+        pytest.param("planar", "first order", marks=pytest.mark.slow),
         ("planar", "wander"),
         pytest.param("planar", "moving average", marks=pytest.mark.slow),
         pytest.param("six", "velocity drive", marks=pytest.mark.slow),

@@ -502,7 +502,8 @@ def test_all_that_joints_may_have_is_no_arm_without_a_drive(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "early", [0.0, pytest.param(0.005, marks=pytest.mark.slow), 0.025]
+    "early",
+    [*(pytest.param(s, marks=pytest.mark.slow) for s in (0.0, 0.005)), 0.025],
 )
 def test_commands_that_act_before_their_rows_are_told_whatever_is_hidden(
     tmp_path, early
@@ -517,7 +518,7 @@ def test_commands_that_act_before_their_rows_are_told_whatever_is_hidden(
     assert right.commands_early() == 0.0
 
 
-@pytest.mark.parametrize("early", [0.0, 0.025])
+@pytest.mark.parametrize("early", [pytest.param(0.0, marks=pytest.mark.slow), 0.025])
 def test_early_commands_are_not_what_joints_lack_where_all_is_smooth(tmp_path, early):
     """To slow motions it is damping, or a rotor, of each joint; one number does it."""
     scene, joints = four_joints(tmp_path)

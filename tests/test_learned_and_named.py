@@ -136,7 +136,7 @@ SLOW = pytest.mark.slow
         (PUCK, {"mass": 1.5}),
         pytest.param(PUCK, {"mass": 0.25}, marks=SLOW),
         pytest.param(PUCK, {"damping": 10.0}, marks=SLOW),
-        (bench.DOOR, {"mass": 4.0}),
+        pytest.param(bench.DOOR, {"mass": 4.0}, marks=SLOW),
         pytest.param(bench.DOOR, {"damping": 1.6}, marks=SLOW),
         pytest.param(bench.DOOR, {"damping": 0.4}, marks=SLOW),
         # It is pushed for 0.15 s, and coasts.
@@ -173,8 +173,8 @@ def test_the_learner_and_gap_agree(task, true, tmp_path):
 
 @pytest.mark.parametrize(
     "task",
-    [bench.DOOR, pytest.param(bench.DRAWER, marks=SLOW), bench.LID,
-     pytest.param(bench.LEG, marks=SLOW)],
+    [bench.DOOR, *(pytest.param(t, marks=SLOW)
+                   for t in (bench.DRAWER, bench.LID, bench.LEG))],
     ids=lambda t: t.name,
 )  # fmt: skip
 def test_the_right_model_is_no_gap(task, tmp_path):

@@ -340,8 +340,9 @@ def test_a_bad_demonstration_is_refused(what):
         pattern_from_demonstration(t, pose, force)
 
 
-@pytest.mark.parametrize("turn", [45, 90, 135, 160, 170])
-@pytest.mark.parametrize("a_max", [0.5, 5.0])
+@pytest.mark.parametrize(
+    ("turn", "a_max"), [(45, 0.5), (90, 5.0), (160, 0.5), (170, 5.0)]
+)
 def test_a_corner_too_sharp_for_its_speed_is_refused_and_has_a_least_time(turn, a_max):
     """v^2 kappa, by finite differences of the reference, within acceleration_max."""
     angle = np.deg2rad(turn)
@@ -353,7 +354,7 @@ def test_a_corner_too_sharp_for_its_speed_is_refused_and_has_a_least_time(turn, 
         with pytest.raises(ValueError, match="bends within|expected more time"):
             MotionPattern((replace(segment, times=[0.0, share * least]),), a_max)
     pattern = MotionPattern((replace(segment, times=[0.0, 1.001 * least]),), a_max)
-    times = np.linspace(0.0, pattern.duration, 20001)
+    times = np.linspace(0.0, pattern.duration, 5001)
     p = np.array([pattern.pose(t)[:3] for t in times])
     a = np.diff(p, n=2, axis=0) / (times[1] - times[0]) ** 2
     largest = np.linalg.norm(a, axis=1).max()

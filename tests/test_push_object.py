@@ -585,7 +585,6 @@ def test_nothing_to_learn_is_refused(settings, said):
 )
 def test_a_setting_that_the_chosen_parts_do_not_read_is_refused(choice, setting, value):
     config = PushObjectConfig(camera=CameraConfig(renderer="drawn"), **choice)
-    make_push_object(config)
     part, _, name = setting.rpartition(".")
     setattr(attrgetter(part)(config), name, value)
     ((key, chosen),) = (choice or {"object.shape": "t"}).items()

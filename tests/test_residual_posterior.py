@@ -409,9 +409,9 @@ def test_before_anything_is_touched_the_prior_stays():
 
 
 def test_a_wall_that_was_moved_is_found_again():
-    """15 mm nearer, where ten minutes of air had ruled it out; the model with what was
-    learned so far sees no contact there, as a push moves the mass by half of it."""
-    model, n = between_walls(1.0, 0.03), 12000
+    """15 mm nearer, where three minutes of air had ruled it out; the model with what
+    was learned so far sees no contact there, as a push moves the mass by half of it."""
+    model, n = between_walls(1.0, 0.03), 3600
     x, u = visits(model, [3.0] * 40)
     away, still = np.tile([0.029, 0.0], (n, 1)), np.zeros((n, 1))
     moved = model.with_residual(np.array([0.0, -15e-3 / LEARN]))

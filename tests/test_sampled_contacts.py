@@ -515,7 +515,6 @@ def _set(config, setting, value):
 )
 def test_a_setting_that_the_chosen_parts_do_not_read_is_refused(choice, setting, value):
     made = BallRollingConfig(camera=CameraConfig(renderer="drawn"), **choice)
-    make_ball_rolling(made)
     _set(made, setting, value)
     ((name, chosen),) = (choice or {"contact_sequence": "cycle"}).items()
     with pytest.raises(ValueError, match=f"^{setting} is {value}, .*{name}={chosen}$"):

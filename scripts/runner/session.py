@@ -26,7 +26,6 @@ from pydrake.systems.framework import (
 )
 from tqdm import tqdm
 
-from makebreak.diagrams.station import MONITOR
 from makebreak.gap.data.table import write_recording
 from makebreak.models.scene import Scene, apply_initial_velocities
 from makebreak.models.scene_file import write_scene
@@ -309,6 +308,9 @@ class Session:
     def _note_limits(self, diagram: Diagram, root: Context) -> None:
         if not diagram.HasSubsystemNamed("station"):
             return
+        # Here: it takes long to import, and not every diagram has one.
+        from makebreak.diagrams.station import MONITOR
+
         station = diagram.GetSubsystemByName("station")
         if station.HasOutputPort(MONITOR):
             seen = station.GetOutputPort(MONITOR).Eval(
