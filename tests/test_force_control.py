@@ -138,10 +138,10 @@ def reference(p=START, v=(0, 0, 0), a=(0, 0, 0)):
 def pressing(plant, target=6.0, **options):
     """The sphere, brought to just above the table, presses on it."""
     loop = Loop(plant, **options)
-    for z in np.linspace(START[2], 0.0202, 30):
+    for z in np.linspace(START[2], 0.0202, 60):
         loop.set(x_desired=reference([*START[:2], z]))
         loop.run(0.02)
-    loop.run(0.3)
+    loop.run(0.5)
     assert np.all(loop.force() == 0.0)
     loop.press(DOWN, target)
     return loop

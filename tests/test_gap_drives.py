@@ -39,7 +39,7 @@ def targets(time):
     )
 
 
-def recorded(folder, drive, hidden, seconds=24.0, effort=False, bias=0.0):
+def recorded(folder, drive, hidden, seconds=16.0, effort=False, bias=0.0):
     """A scene and a recording of it at 100 Hz in which `hidden` acts as well."""
     scene = with_effects(replace(double(folder), actuation=ACTUATION[drive]), ROTORS)
     truth = replace(scene, effects=[*scene.effects, *(Effect(*h) for h in hidden)])

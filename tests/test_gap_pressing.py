@@ -151,7 +151,7 @@ def record(
     table, wall, mass, longer = float(table), float(wall), float(mass), float(longer)
     mu, points = np.array(mu), np.array(points)
     for episode in range(n):
-        time = np.arange(0.0, 6.0 + waits, 1e-3)
+        time = np.arange(0.0, 5.0 + waits, 1e-3)
         state = np.array([0.1, -0.2, 0.12 + high, 0.0, 0.0, 0.0])
         states, efforts, forces = [], [], []
         for t in time - waits:
@@ -743,7 +743,7 @@ def test_windows_of_what_presses_know_no_friction_better_than_its_law(right):
     sure, unsure = (PushWindows(scene, recordings, pairs=pairs)
                     for pairs in ((), problem.pressed()))  # fmt: skip
     y, w = sure.channels.index("gantry.y.position"), sure.windows[-1]
-    assert w.start > 5.0  # It slides along both.
+    assert w.start > 4.1  # It slides along both, one way.
     seconds = float(np.ptp(recordings[w.recording].time[w.rows]))
     known, more = (each.windows[-1].std[-1, y] for each in (sure, unsure))
     off = LAW * (TABLE_MU + WALL_MU) * 8.0 / MASS * seconds**2 / 2.0

@@ -32,7 +32,8 @@ from makebreak.models.scene_file import write_scene
 from makebreak.models.scene_schema import SupplySection
 
 STEP = 1e-3  # [rad] of the encoders.
-RATE, SECONDS = 50.0, 40.0
+RATE, SECONDS = 50.0, 24.0
+LONG = 40.0  # [s], where much is to be told apart.
 
 
 def two_joints(folder):
@@ -61,12 +62,12 @@ def four_joints(folder):
 ARMS = {"two": two_joints, "four": four_joints}
 
 
-def goals(n, rng):
+def goals(n, rng, seconds=SECONDS):
     """Steps that are held, and slow sines, in turn: (n, m)."""
-    time = np.arange(0.0, SECONDS, 1.0 / RATE)
+    time = np.arange(0.0, seconds, 1.0 / RATE)
     out = np.empty((n, len(time)))
     for k in range(n):
-        level = rng.uniform(-0.4, 0.4, int(SECONDS / 0.9) + 1)
+        level = rng.uniform(-0.4, 0.4, int(seconds / 0.9) + 1)
         steps = level[(time / 0.9).astype(int)]
         sine = 0.3 * np.sin((0.8 + 0.3 * k) * time + k)
         out[k] = np.where(time % 16.0 < 8.0, steps, sine)
@@ -103,14 +104,14 @@ def log_of(
     return file, names
 
 
-def recorded(folder, arm, hidden, seed=0, early=0.0):
+def recorded(folder, arm, hidden, seed=0, early=0.0, seconds=SECONDS):
     """A scene, and a recording of it in which `hidden` acts as well, and commands act
     before their rows [s]."""
     rng = np.random.default_rng(seed)
     scene, joints = ARMS[arm](folder)
     truth = with_effects(scene, *hidden)
     truth = replace(scene, effects=[*scene.effects, *truth.effects])
-    time, told = goals(len(joints), rng)
+    time, told = goals(len(joints), rng, seconds)
 
     def read(rows):
         return np.round((rows + 2e-4 * rng.normal(size=rows.shape)) / STEP) * STEP
@@ -122,8 +123,8 @@ def recorded(folder, arm, hidden, seed=0, early=0.0):
     return scene, file
 
 
-def equations_of(folder, arm, hidden, early=0.0):
-    scene, file = recorded(folder, arm, hidden, early=early)
+def equations_of(folder, arm, hidden, early=0.0, seconds=SECONDS):
+    scene, file = recorded(folder, arm, hidden, early=early, seconds=seconds)
     problem, _ = problem_for(scene, read_recordings([file]), SceneDynamics(scene))
     assert isinstance(problem, MechanismProblem)
     return problem
@@ -184,7 +185,7 @@ def test_nothing_is_named_where_nothing_is_hidden(tmp_path, arm):
 def test_friction_that_changes_with_the_position_is_named(tmp_path):
     truth = dict(coulomb_low=2.0, coulomb_high=0.4, low=-0.3, high=0.3)
     hidden = [("joint_position_friction", ["d.j2"], truth)]
-    (choice,) = select(equations_of(tmp_path, "two", hidden)).choices
+    (choice,) = select(equations_of(tmp_path, "two", hidden, seconds=LONG)).choices
     effect = choice.effect
     assert (effect.kind, list(effect.at)) == ("joint_position_friction", ["d.j2"])
     # The ends are those of the motion.
@@ -202,7 +203,7 @@ GAIN = "a drive's gain, 8 % less, is named as well: rows at 50 Hz smooth how it 
     "arm", ["two", pytest.param("four", marks=pytest.mark.xfail(reason=GAIN))]
 )
 def test_what_all_joints_have_is_named_with_a_value_for_each(tmp_path, arm):
-    problem = equations_of(tmp_path, arm, HIDDEN[arm])
+    problem = equations_of(tmp_path, arm, HIDDEN[arm], seconds=LONG)
     chosen = select(problem)
     found = {(c.effect.kind, c.effect.at[0]): c.effect for c in chosen.choices}
     expected = {(kind, j) for kind, _, _ in HIDDEN[arm] for j in problem.joints}
@@ -297,7 +298,7 @@ def test_a_joint_that_differs_gets_a_value_of_its_own(tmp_path):
 def test_joints_that_all_differ_are_found_together(tmp_path):
     hidden = [("joint_coulomb_friction", ["d.j1"], dict(coulomb=1.6)),
               ("joint_coulomb_friction", ["d.j2"], dict(coulomb=0.3))]  # fmt: skip
-    problem = equations_of(tmp_path, "two", hidden)
+    problem = equations_of(tmp_path, "two", hidden, seconds=LONG)
     found = {tuple(c.effect.at): c.effect for c in select(problem).choices}
     assert set(found) == {("d.j1",), ("d.j2",)}
     for kind, at, p in hidden:

@@ -16,7 +16,7 @@ from makebreak.gap.workflow import run_gap
 from makebreak.models.scene_file import write_scene
 
 JOINTS = ("d.j1", "d.j2")
-SECONDS, RATE = 24.0, 200.0
+SECONDS, RATE = 16.0, 200.0
 FRICTION = [("joint_coulomb_friction", "d.j1", dict(coulomb=0.4)),
             ("joint_coulomb_friction", "d.j2", dict(coulomb=0.25))]  # fmt: skip
 PUSH = (9.0, 10.1, 3.0)  # From, to [s], [N m] on the first joint.
