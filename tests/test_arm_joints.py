@@ -196,8 +196,9 @@ def test_a_gantry_goes_where_it_is_sent_and_no_faster_than_its_rails_may():
     assert 3.0 < fastest < 4.1  # 0.8 of 5 m/s.
 
 
-@pytest.mark.parametrize("frequency", [1.0, 2.5, 4.0])
-@pytest.mark.parametrize("worst", [True, False])
+@pytest.mark.parametrize(
+    ("worst", "frequency"), [(True, 0.0), *((False, f) for f in (1.0, 2.5, 4.0))]
+)
 def test_a_stiffness_on_the_port_drives_no_swing(frequency, worst):
     """The system in its loop: mass, spring and tank together never gain energy."""
     config = ImpedanceConfig(stiffness=[200.0] * 3 + [0.0] * 3, damping=[5.0] * 6)

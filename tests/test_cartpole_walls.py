@@ -113,7 +113,9 @@ def simulated(config, multibody=False, duration=8.0, x=None):
     return [np.array(column) for column in zip(*rows, strict=True)]
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    "seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 2))]
+)
 def test_learns_both_walls_and_settles(seed):
     config = CartpoleWallsConfig(seed=seed)
     x, _, r = simulated(config)

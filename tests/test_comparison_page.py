@@ -115,7 +115,9 @@ def test_a_driven_joint_moves_as_with_its_input(tmp_path, what):
         assert np.sqrt(np.mean(before**2)) == pytest.approx(table.before)
 
 
-@pytest.mark.parametrize("what", ["effort measured", "servo"])
+@pytest.mark.parametrize(
+    "what", [pytest.param("effort measured", marks=pytest.mark.slow), "servo"]
+)
 def test_sentence_table_page_animation_and_json_say_the_same(tmp_path, what):
     """All against rms errors that are computed here from the windows' samples."""
     scene, recordings = swung(tmp_path, what)

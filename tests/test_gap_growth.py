@@ -76,7 +76,7 @@ def upright(folder, noise, seconds=90.0, hz=100.0):
     return pendulum(folder, gravity=-UP), read_recordings([folder / "run.csv"])
 
 
-@pytest.mark.parametrize("noise", [0.05, 0.2])
+@pytest.mark.parametrize("noise", [pytest.param(0.05, marks=pytest.mark.slow), 0.2])
 def test_a_perfect_model_of_a_joint_on_its_head_leaves_the_noise(tmp_path, noise):
     model = WindowModel(*upright(tmp_path, noise))
     e = model.errors(model.simulate(()))

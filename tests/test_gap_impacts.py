@@ -49,7 +49,7 @@ OWN_WALL = """<sdf version="1.7"><model name="slide">
 _PARAMETER = {"damper": "damping"}  # Of the effect that is the cart's field.
 
 
-def ran(folder, seed, seconds=16.0, **hidden):
+def ran(folder, seed, seconds=10.0, **hidden):
     rng = np.random.default_rng(seed)
     cart = cart_world.Cart(
         mass=rng.uniform(0.8, 2.0), stiffness=rng.uniform(8e3, 3e4),

@@ -19,7 +19,9 @@ from makebreak.gap.simulation.windows import WindowModel
 from makebreak.systems.numerics.filters import MovingAverage
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    "seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 2))]
+)
 def test_what_stairs_do_beside_their_line_is_that_of_two_simulations(seed):
     rng = np.random.default_rng(seed)
     mass = np.array([[3.8, 0.9], [0.9, 0.5]]) * 1e-3

@@ -546,7 +546,7 @@ def stepped(scene, joints, folder, step, implicit):
     braked = np.array([plant.GetJointByName(j.split(".")[1]).default_damping()
                        for j in joints])  # fmt: skip
     time, told = goals(len(joints), np.random.default_rng(0))
-    time, told = time[time < 24.0], told[:, time < 24.0]
+    time, told = time[time < 12.0], told[:, time < 12.0]
     kp, kd = (np.array(getattr(scene.actuation, gain)) for gain in ("kp", "kd"))
     rows, q, v = [], np.array(told[:, 0]), np.zeros(len(joints))
     for t in np.arange(0.0, time[-1], step):

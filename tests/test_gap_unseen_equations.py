@@ -31,7 +31,7 @@ def pushes(tmp_path_factory):
     world = push_world.a_world(rng)
     truth = push_world.with_hidden(world, ["contact_friction"], rng, 1.0)
     parts = []
-    for name, episodes in (("seen", 4), ("unseen", 3)):
+    for name, episodes in (("seen", 3), ("unseen", 2)):
         folder = tmp_path_factory.mktemp(name)
         table, noise = push_world.record(truth, rng, episodes=episodes)
         scene = push_world.write(folder, world, table, noise)

@@ -370,7 +370,7 @@ def test_what_moves_a_free_state_is_learned_only_where_nothing_touches(gaps, is_
 
 
 @pytest.mark.parametrize("left, right", [(-8e-3, 5e-3), (6e-3, 6e-3), (0.0, -5e-3)])
-@pytest.mark.parametrize("dt", [0.005, 0.05])
+@pytest.mark.parametrize("dt", [pytest.param(0.005, marks=pytest.mark.slow), 0.05])
 def test_each_of_two_contacts_gets_its_own_residual_and_deviation(left, right, dt):
     model, truth = between_walls(0.03, 0.03, dt), between_walls(0.03, 0.03, dt)
     truth = truth.with_residual(np.array([left, right]) / dt)
@@ -514,7 +514,13 @@ def fingers_and_box(left, right):
     return text + "</model></sdf>"
 
 
-@pytest.mark.parametrize("left, right", [(6e-3, 6e-3), (-6e-3, -6e-3), (6e-3, -6e-3)])
+@pytest.mark.parametrize(
+    "left, right",
+    [
+        *(pytest.param(x, x, marks=pytest.mark.slow) for x in (6e-3, -6e-3)),
+        (6e-3, -6e-3),
+    ],
+)
 def test_two_fingers_find_both_faces_of_a_box_of_another_width(left, right):
     """The world is a MultibodyPlant; the fingers move the box to and fro."""
     plants = []

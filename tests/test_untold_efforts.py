@@ -67,7 +67,7 @@ def proposed(folder):
     return read_scene(folder / "scene.yaml")
 
 
-@pytest.mark.parametrize("friction", [0.0, 0.3])
+@pytest.mark.parametrize("friction", [0.0, pytest.param(0.3, marks=pytest.mark.slow)])
 def test_the_other_joints_are_judged_without_the_effort_that_is_missing(
     tmp_path, friction
 ):
