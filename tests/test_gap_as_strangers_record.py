@@ -24,7 +24,7 @@ def written(folder, change=None):
     """Pushes with nothing hidden, their table changed before it is written."""
     rng = np.random.default_rng(61)
     world = push_world.a_world(rng)
-    table, noise = push_world.record(world, rng, episodes=3)
+    table, noise = push_world.record(world, rng, episodes=4)
     if change is not None:
         table = change(table)
     return world, push_world.write(folder, world, table, noise)

@@ -291,7 +291,7 @@ def test_a_body_that_drake_cannot_scale_has_no_size_to_name(tmp_path):
     """It is seen as a mesh; a simulation with another size would end in an error."""
     rng = np.random.default_rng(71)
     world = push_world.a_world(rng)
-    table, noise = push_world.record(world, rng, episodes=3)
+    table, noise = push_world.record(world, rng, episodes=1)
     scene = push_world.write(tmp_path, world, table, noise)
     recordings = read_recordings([tmp_path / "recording.csv"])
     for sized in (True, False):
