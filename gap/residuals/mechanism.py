@@ -97,6 +97,7 @@ OVERLAP = 1.3  # What neighbouring test functions share of white noise.
 # A base is mounted otherwise than the scene says from this angle [rad] on, where its
 # gravity comes out as large as it is, to this share.
 TURNED, SAME_GRAVITY = 0.3, 0.1
+AT_ONCE = 128  # Candidates of which one product of matrices is formed.
 KEPT = 0.1  # Of its mass, that a link keeps at least; of inertia, a joint.
 
 
@@ -230,29 +231,35 @@ class MechanismProblem(InverseModel, GapProblem):
         """What a rich model and one candidate more leave of rows (m,): of each channel
         with the candidate that fits its training rows best, if that takes half of it.
         rich (m, p)."""
-        t, channel = self.train(), self.channel_of_rows()
+        t, k = self.train(), len(self.names())
         size = np.linalg.norm(rich[t], axis=0)
         rich = rich[:, size > 0.0] / size[size > 0.0]
         back = np.linalg.pinv(rich[t], rcond=1e-8)
-        out = np.array(left)
-        rows = [np.flatnonzero(channel == k) for k in range(len(self.names()))]
-        fitted = [mine[t[mine]] for mine in rows]
-        least = [HALF * float(left[some] @ left[some]) for some in fitted]
+        out = np.array(left).reshape(-1, k)
+        least = HALF * _powers(left[t], k)
         # A gain is in the rich model, of what the model needs. Beside that a gain of
         # the measured effort would cancel all, also what models are off by.
         found = [c for c in self._found or () if KINDS[c.kind].path != "gain"]
-        for X in (x for c in found for x in c.columns):
+        every = [x for c in found for x in c.columns]
+        for some in (every[i : i + AT_ONCE] for i in range(0, len(every), AT_ONCE)):
+            X = np.hstack(some)
             beside = X - rich @ (back @ X[t])
-            size = np.linalg.norm(beside[t], axis=0)
-            beside = beside[:, size > 1e-6 * np.linalg.norm(X[t], axis=0)]
-            if not beside.shape[1]:
-                continue
-            r = left - beside @ np.linalg.lstsq(beside[t], left[t], rcond=1e-8)[0]
-            for k, some in enumerate(fitted):
-                power = float(r[some] @ r[some])
-                if power < least[k]:
-                    least[k], out[rows[k]] = power, r[rows[k]]
-        return out
+            own = np.linalg.norm(beside[t], axis=0) > 1e-6 * np.linalg.norm(
+                X[t], axis=0
+            )
+            ends = np.cumsum([x.shape[1] for x in some])[:-1]
+            for x, mine in zip(
+                np.split(beside, ends, 1), np.split(own, ends), strict=True
+            ):
+                if not mine.any():
+                    continue
+                x = x[:, mine]
+                r = left - x @ np.linalg.lstsq(x[t], left[t], rcond=1e-8)[0]
+                power = _powers(r[t], k)
+                better = power < least
+                least[better] = power[better]
+                out[:, better] = r.reshape(-1, k)[:, better]
+        return out.ravel()
 
     def _unbent(
         self, rich: np.ndarray, n: Nuisances, prior
@@ -984,6 +991,11 @@ def beyond_noise(off: np.ndarray, noise: np.ndarray) -> float:
     leave as much."""
     size, times = (ROBUST * np.median(np.abs(x)) for x in (off, off / noise))
     return float(size * np.sqrt(1.0 - 1.0 / times**2)) if times > MISFIT else 0.0
+
+
+def _powers(rows: np.ndarray, k: int) -> np.ndarray:
+    """(k,) of rows (m,) of k channels in turns, the sum of squares of each."""
+    return np.sum(rows.reshape(-1, k) ** 2, axis=0)
 
 
 def _without_gains(n: Nuisances) -> Nuisances:

@@ -291,7 +291,8 @@ class WhitenedRows(MechanismMotion):
                 m = len(T) * (n + len(size))
                 mine = out[first : first + m].reshape(len(T), -1, *rows.shape[1:])
                 first += m
-                mine[:, :n] = np.einsum("bij,bj...->bi...", T, mine[:, :n])
+                efforts = mine[:, :n]
+                efforts[:] = (T @ efforts.reshape(len(T), n, -1)).reshape(efforts.shape)
                 for c, by in enumerate(size):
                     mine[:, n + c] *= by
             return out

@@ -378,13 +378,13 @@ def write_comparison(
 def effects_table(result: GapResult, told: str = "") -> Table:
     """The table at the end of a run: the effects found and the held-out error.
 
-    Args: told: text whose values are left out.
+    Args: told: what is read beside it; where all values stand there, none is repeated.
     """
     rows: list[tuple] = []
     for each in result.effects:
         values = ", ".join(
             f"{name} {p.text()} {p.unit}".rstrip()
-            for name, p in not_told(each, told).items()
+            for name, p in each.parameters.items()
         )
         rows.append((each.kind, list(each.at), values, next_best(each.evidence) or "-"))
     g = result.gap
@@ -402,7 +402,7 @@ def effects_table(result: GapResult, told: str = "") -> Table:
             "after".format(*g.in_equations)
         )
     columns = ["effect", "at", "parameters", "next best"]
-    if not any(row[2] for row in rows):
+    if not any(not_told(each, told) for each in result.effects):
         columns.remove("parameters")
         rows = [row[:2] + row[3:] for row in rows]
     return Table("\n".join(summary_lines(result)), columns, rows, notes=notes)
