@@ -93,12 +93,14 @@ def add_parameter_learner(
     users: Sequence[LeafSystem],
     rows: int,
     dt_sec: float,
+    scale: Sequence[float] = (),
 ) -> OutputPort:
     """Adds `parameter_learner`, and gives what it learns but the gap to the users.
 
     Args: state: of u_and_ready; users: their port `parameters` has all but the gap, in
         order, and the first one builds the LCS; rows: the first ones of it, whose gap
-        is learned; dt_sec: time step over which a residual is a velocity [s].
+        is learned; dt_sec: time step over which a residual is a velocity [s]; scale
+        (n,): of the users' values over the learner's; empty: the same.
     Returns: the gap as r_comp (n_lam,) [m/s], of the system `learned_residual`.
     """
     builder.AddNamedSystem("parameter_learner", learner)
@@ -110,7 +112,8 @@ def add_parameter_learner(
     items = learner.model.parameters.items
     is_gap = np.array([p.kind == "gap" for p in items])
     if not is_gap.all():
-        values = _gain(builder, "learned_values", learner, np.eye(len(items))[~is_gap])
+        own = np.diag(scale) if len(scale) else np.eye(len(items))
+        values = _gain(builder, "learned_values", learner, own[~is_gap])
         for user in users:
             builder.Connect(values, user.GetInputPort("parameters"))
     residual = np.zeros((users[0].model.n_lam, len(items)))

@@ -48,6 +48,7 @@ from makebreak.diagrams.push_object_config import (
     SET_BY_DIAGRAM,
     STEADY,
     TIP_MASS,
+    WEIGHT,
     PushModelConfig,
     PushObjectConfig,
     c3_config,
@@ -189,8 +190,13 @@ def make_push_object(
                 LEARN,
                 OFFSET["learner"],
             )
+            # The planner's friction of object and table is that of a heavier object.
+            scale = [
+                1.0 / model.weight if p.kind == "friction" and p.pairs != [0] else 1.0
+                for p in items
+            ]
             r_comp = add_parameter_learner(
-                builder, parameter_learner, past, users, N_TIP, LEARN
+                builder, parameter_learner, past, users, N_TIP, LEARN, scale
             )
         else:
             learner = _add_learner(builder, config, lcs["learn"], past)
@@ -233,6 +239,11 @@ class _Model:
     @property
     def rolls(self) -> bool:
         return bool(rolling_axis(self.spec))
+
+    @property
+    def weight(self) -> float:
+        """Of the object for the planner, over its own."""
+        return 1.0 if self.rolls else WEIGHT
 
 
 def _refuse_unused(config: PushObjectConfig) -> None:
@@ -310,17 +321,17 @@ def _add_lcs_builders(
     builder: DiagramBuilder, model: _Model, items: list[Parameter]
 ) -> dict[str, AnitescuLcsBuilder]:
     """The contact model for planning, for the command between knots, for learning."""
-    pairs = contact_pairs(model.spec, model.friction)
     added = {}
-    for name, dt, period in (
-        ("plan", PLAN_DT, CONTROL),
-        ("command", CONTROL, CONTROL),
-        ("learn", LEARN, LEARN),
+    for name, dt, period, weight in (
+        ("plan", PLAN_DT, CONTROL, model.weight),
+        ("command", CONTROL, CONTROL, model.weight),
+        ("learn", LEARN, LEARN, 1.0),
     ):
+        pairs = contact_pairs(model.spec, model.friction, weight)
         added[name] = builder.AddNamedSystem(
             f"lcs_{name}",
             AnitescuLcsBuilder(
-                make_tip_and_object(model.spec, model.tip)[0],
+                make_tip_and_object(model.spec, model.tip, weight=weight)[0],
                 LcsBuilderConfig(
                     pairs, dt, None, period, OFFSET["lcs"], parameters=items
                 ),

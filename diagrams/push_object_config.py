@@ -76,6 +76,11 @@ LEANING = 4.0
 # about a horizontal axis: 2 N that are 16 mm higher turn this by a third of what counts
 # as noise. A press on the object's edge was taken for a mass that keeps it down.
 STEADY = 0.2
+# Weight of an object that slides in the planner's model over its own, whose friction
+# with the table is as much lower, so that it takes the same force to slide it.
+# Anitescu's contact throws what slides upwards with mu |v_t|, which presses it on the
+# table: in a step it is slowed as by a friction of mu (1 + mu^2), without this.
+WEIGHT = 4.0
 N_TIP = 4  # The first entries of lam: the contact of tip and object.
 # Settings of the systems that make_push_object computes, so that users cannot.
 SET_BY_DIAGRAM = {
@@ -241,16 +246,18 @@ def rolling_axis(spec: PushedObject) -> list[float]:
     return [1.0, 0.0, 0.0] if spec.shape == "cylinder" else []
 
 
-def contact_pairs(spec: PushedObject, friction: float) -> list[ContactPair]:
-    """Contacts of the planner's LCS: tip and object, then each support of the object
-    with the table."""
+def contact_pairs(
+    spec: PushedObject, friction: float, weight: float = 1.0
+) -> list[ContactPair]:
+    """Contacts of an LCS: tip and object, then each support of the object with the
+    table, for an object of so many times its weight."""
     n = len(support_spheres(spec)[0])
     # Friction edges along the vertical do not jump as the normal turns about it.
     tip = ContactPair(
         "tip::tip", f"{OBJECT}::{OBJECT}", friction, tangent=[0.0, 0.0, 1.0], closest=1
     )
     return [tip] + [
-        ContactPair(f"{OBJECT}::support_{i}", "table::table", friction)
+        ContactPair(f"{OBJECT}::support_{i}", "table::table", friction / weight)
         for i in range(n)
     ]
 

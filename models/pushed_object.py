@@ -418,13 +418,17 @@ def object_file(spec: PushedObject) -> str:
 
 
 def make_tip_and_object(
-    spec: PushedObject, tip: TipAndBall | None = None, steady: float = 0.0
+    spec: PushedObject,
+    tip: TipAndBall | None = None,
+    steady: float = 0.0,
+    weight: float = 1.0,
 ):
     """The planner's model of an arm that pushes an object: a point mass and a free body
     on a table, as make_tip_and_ball for a ball.
 
     Args: tip: only its tip_mass [kg] and tip_radius [m] are used; steady: radius of
-        gyration that is added about the horizontal axes, against tilting [m].
+        gyration that is added about the horizontal axes, against tilting [m]; weight:
+        factor of the object's weight, not of its mass.
     Returns: (diagram, plant, scene_graph) with the bodies `tip`, a sphere; `object`,
         with collision geometries object::part_i, its convex parts, and
         object::support_i, the spheres that it stands on; and `table`, a wide box with
@@ -435,6 +439,8 @@ def make_tip_and_object(
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=1e-3)
     add_tip(plant, TipAndBall() if tip is None else tip)
+    gravity = plant.mutable_gravity_field()
+    gravity.set_gravity_vector(weight * gravity.gravity_vector())
     inertia = object_inertia(spec)
     unit = inertia.get_unit_inertia()
     moments = unit.get_moments() + steady**2 * np.array([1.0, 1.0, 0.0])

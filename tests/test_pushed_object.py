@@ -14,6 +14,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from scipy.spatial import ConvexHull
 
+from makebreak.diagrams.push_object_config import contact_pairs
 from makebreak.models.effects.kind import Effect
 from makebreak.models.model_files import MODELS
 from makebreak.models.pushed_object import (
@@ -305,6 +306,25 @@ def test_three_supports_carry_alike_and_resist_turning_as_an_even_pressure(
 
 def test_the_scenes_object_is_the_default_one():
     assert (MODELS / "pushed_t.sdf").read_text() == object_sdf(PushedObject())
+
+
+@pytest.mark.parametrize("weight", [1.0, 4.0])
+def test_a_heavier_planners_object_is_slowed_as_coulomb_says(weight):
+    """In closed form: Anitescu's contact opens with its friction times the speed, and
+    what accelerates the object upwards adds to the force that slows it."""
+    mu, dt, v, g = 0.5, 0.02, 0.3, 9.81
+    spec = PushedObject("box")
+    diagram = make_tip_and_object(spec, weight=weight)[0]
+    lcs = AnitescuLcs(diagram, contact_pairs(spec, mu, weight), dt)
+    x = lcs.x_default.copy()
+    x[:3], x[P_BALL] = [0.1, 0.3, 0.1], [0.5, 0.0, rest_height(spec)]
+    x[V_BALL] = [v, 0.0, 0.0]
+    x_next, _ = simulate(lcs.build(x, np.zeros(3)), x, np.zeros(3))
+    speed = (v - mu * g * dt) / (1.0 + (mu / weight) ** 2)
+    # Supports give way by eps_c.
+    expected = [speed, 0.0, mu / weight * speed]
+    np.testing.assert_allclose(x_next[V_BALL], expected, atol=2e-3)
+    assert (v - x_next[V_BALL][0] < 1.05 * mu * g * dt) == (weight == 4.0)
 
 
 @pytest.mark.parametrize("shape", [*FLAT, "cylinder"])
