@@ -78,8 +78,8 @@ LEANING = 4.0
 STEADY = 0.2
 # Weight of an object that slides in the planner's model over its own, whose friction
 # with the table is as much lower, so that it takes the same force to slide it.
-# Anitescu's contact throws what slides upwards with mu |v_t|, which presses it on the
-# table: in a step it is slowed as by a friction of mu (1 + mu^2), without this.
+# Anitescu's contact throws what slides upwards with mu |v_t|: past the tip, whose
+# friction then holds it down, and so fast that its inertia is 1 + mu^2 times its own.
 WEIGHT = 4.0
 N_TIP = 4  # The first entries of lam: the contact of tip and object.
 # Settings of the systems that make_push_object computes, so that users cannot.

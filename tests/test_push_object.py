@@ -24,7 +24,7 @@ from makebreak.diagrams.push_object import (
     PushObjectConfig,
     make_push_object,
 )
-from makebreak.diagrams.push_object_config import PushParametersConfig
+from makebreak.diagrams.push_object_config import WEIGHT, PushParametersConfig
 from makebreak.diagrams.push_object_scenes import (
     model_object,
     model_scene,
@@ -543,7 +543,8 @@ def test_what_the_learner_of_parameters_knows_is_planned_with():
     ]  # fmt: skip
     sure = Belief(np.array([1.0, -1.0, 0.5, 2.0]), 1e14 * np.eye(4))
     its.SetAbstractState(0, replace(learner._memory_of(its), belief=sure))
-    expected = [0.4 * np.exp(0.5), 0.5 * np.exp(-0.5), 0.5 * np.exp(0.25)]
+    on_table = 0.5 * np.exp(0.25) / WEIGHT  # The planner's object is as much heavier.
+    expected = [0.4 * np.exp(0.5), 0.5 * np.exp(-0.5), on_table]
     for name in ("lcs_plan", "lcs_command", "contact_sampler"):
         system, its = own(name)
         values = system.GetInputPort("parameters").Eval(its)
@@ -553,6 +554,19 @@ def test_what_the_learner_of_parameters_knows_is_planned_with():
         r_comp = system.GetInputPort("r_comp").Eval(its)
         np.testing.assert_allclose(r_comp[:4], 0.008 / 0.05, rtol=1e-6)
         assert not r_comp[4:].any()
+
+
+@pytest.mark.parametrize(("shape", "heavier"), [("t", WEIGHT), ("cylinder", 1.0)])
+def test_the_planner_s_object_is_heavy_on_a_smooth_table_if_it_slides(shape, heavier):
+    """Its friction is as great as it is; the learner's object is not heavier."""
+    diagram = make_push_object(PushObjectConfig(object=PushedObject(shape)))
+    for name, weight in (("plan", heavier), ("command", heavier), ("learn", 1.0)):
+        model = diagram.GetSubsystemByName(f"lcs_{name}").model
+        lcs, x = model.at_default(), model.x_default
+        fall = (lcs.A @ x + lcs.d)[N_X - 1] / lcs.dt
+        assert fall == pytest.approx(-9.81 * weight, rel=1e-3)
+        sideways = np.abs(lcs.D[N_X - 3, 4:]).max() / lcs.D[N_X - 1, 4:].max()
+        assert sideways == pytest.approx(0.5 / weight, rel=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -310,8 +310,8 @@ def test_the_scenes_object_is_the_default_one():
 
 @pytest.mark.parametrize("weight", [1.0, 4.0])
 def test_a_heavier_planners_object_is_slowed_as_coulomb_says(weight):
-    """In closed form: Anitescu's contact opens with its friction times the speed, and
-    what accelerates the object upwards adds to the force that slows it."""
+    """In closed form: Anitescu's contact throws it up with friction times speed, and
+    what accelerates it upwards adds to the force that slows it."""
     mu, dt, v, g = 0.5, 0.02, 0.3, 9.81
     spec = PushedObject("box")
     diagram = make_tip_and_object(spec, weight=weight)[0]
