@@ -103,7 +103,7 @@ def exact(name: str, folder: Path, rng) -> tuple[Path, Log]:
     path.write_text(urdf(name, rng))
     robot = read_robot(path)
     n = len(robot.joints)
-    t = np.arange(0.0, 10.0, 1.0 / RATE)
+    t = np.arange(0.0, 12.0, 1.0 / RATE)
     q, v, a = (np.zeros((len(t), n)) for _ in range(3))
     slides = [j.prismatic for j in robot.joints]
     for i in range(n):

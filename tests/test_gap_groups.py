@@ -11,6 +11,7 @@ from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Candidate, Nuisances, SearchPlan
 from makebreak.gap.residuals.contact import _of_surfaces
+from makebreak.gap.residuals.drive_gains import gain_columns
 from makebreak.gap.residuals.mechanism import MechanismProblem
 from makebreak.gap.result import Estimate, Evidence, NamedEffect
 from makebreak.gap.said import said_together
@@ -61,6 +62,13 @@ def test_columns_of_a_gain_hold_however_far_it_is_off(tmp_path):
         assert found.effects(0, np.array([c]))[0].parameters["kp"] == pytest.approx(
             times * now
         )
+    # Friction that the scene has stops joints otherwise than at first: so it does in
+    # what gains within their tolerance give.
+    assert problem.stops_sec > 0.0
+    n = problem.nuisances()
+    columns, _, names = gain_columns(problem)
+    for name, column in zip(names, columns, strict=True):
+        np.testing.assert_allclose(n.columns[:, n.names.index(name)], column, atol=1e-9)
 
 
 def test_pairs_of_one_surface_may_have_one_friction():

@@ -28,7 +28,11 @@ from makebreak.gap.problem import (
     share_left,
 )
 from makebreak.gap.residuals.drive_gains import KEY as GAINS
-from makebreak.gap.residuals.drive_gains import gain_name, with_moved_gains
+from makebreak.gap.residuals.drive_gains import (
+    gain_columns,
+    gain_name,
+    with_moved_gains,
+)
 from makebreak.gap.residuals.inverse import (
     LOOPS,
     VELOCITIES_LATE,
@@ -40,6 +44,7 @@ from makebreak.gap.residuals.mechanism_candidates import (
     inseparable,
     is_mass_of,
     nuisances,
+    of_drives,
     of_no_scene,
     rich_columns,
     tolerances,
@@ -193,7 +198,23 @@ class MechanismProblem(InverseModel, GapProblem):
             ]),))
             for c in self._found or ()
         ]  # fmt: skip
+        if self._dry.any():
+            self._renew_gains()
         return True
+
+    def _renew_gains(self) -> None:
+        """Columns of drives' gains anew: the scene's own friction, which is part of
+        what drives are told, stops joints otherwise."""
+        kinds = dict.fromkeys(c.kind for c in self._found or () if KINDS[c.kind].drive)
+        anew = {(c.kind, c.at): c for kind in kinds for c in of_drives(self, kind)}
+        self._found = [anew.get((c.kind, c.at), c) for c in self._found or ()]
+        n = self._nuisances
+        if n is not None and n.names and not self._weighed:
+            each, _, names = gain_columns(self)
+            known = dict(zip(names, each, strict=True))
+            old = zip(n.names, n.columns.T, strict=True)
+            columns = [known.get(name, x) for name, x in old]
+            self._nuisances = replace(n, columns=np.stack(columns, axis=1))
 
     def _with_friction(self, stops_sec: float) -> tuple[np.ndarray, np.ndarray]:
         """What a rich model leaves (m,), and (n_joints,) what may hold joints [N m] if

@@ -86,7 +86,7 @@ def candidates(
             found += _of_delays(model, kind)
             continue
         if entry.drive:
-            found += _of_drives(model, kind)
+            found += of_drives(model, kind)
             continue
         if entry.signature is None:
             continue
@@ -355,7 +355,7 @@ def _of_delays(model: InverseModel, kind: str) -> list[Candidate]:
     return [c for at in places if (c := _secant(model, kind, at, name)) is not None]
 
 
-def _of_drives(model: InverseModel, kind: str) -> list[Candidate]:
+def of_drives(model: InverseModel, kind: str) -> list[Candidate]:
     """Of drives' own numbers: by the difference that one less makes. Equations are in
     units of what drives are told, so they are linear in the reciprocal of a gain."""
     found = []
