@@ -451,6 +451,17 @@ def test_nan_reference_holds_the_last_good_pose_at_rest(law, chain, index):
     assert rows[-1][1] == REFERENCE_HELD and held[-1][1] == 0
 
 
+@pytest.mark.parametrize(("size", "is_held"), [(0.4, True), (0.9, False), (2.1, True)])
+def test_a_quaternion_far_from_unit_length_is_no_reference(law, chain, size, is_held):
+    state = (law.q_nominal, np.zeros(7))
+    good = reference([0.5, 0.0, 0.102])
+    other = reference([0.6, 0.0, 0.102], quaternion=(size, 0, 0, 0))
+    rows = run_ticks(chain, law, [(*state, good)] * 30 + [(*state, other)] * 30)
+    stayed = run_ticks(chain, law, [(*state, good)] * 60)
+    assert np.array_equal(rows[-1][0], stayed[-1][0]) == is_held
+    assert bool(rows[-1][1] & REFERENCE_HELD) == is_held
+
+
 def test_without_any_good_reference_the_arm_stays(law, chain):
     state = (law.q_nominal, np.zeros(7))
     bad = np.full(19, np.nan)
