@@ -1,5 +1,7 @@
 """Dictionaries of arrays, .npz and .mat, and other files that people have."""
 
+import json
+
 import numpy as np
 import pytest
 from scipy.io import savemat
@@ -101,3 +103,61 @@ def test_patterns_and_folders_name_several_logs(tmp_path):
                        ("d.csv", "does not exist")):  # fmt: skip
         with pytest.raises(ValueError, match=says):
             recording_files([str(tmp_path / word)])
+
+
+@pytest.mark.parametrize("form", ["arrays", "rows", "nested rows"])
+def test_a_json_document_is_its_arrays_or_the_objects_of_its_longest_list(
+    tmp_path, form
+):
+    if form == "arrays":
+        content = {"log": {"t": TIME.tolist(), "q": Q.tolist()}, "joint_names": NAMES}
+        q = "log/q/hip"
+    else:
+        rows = [
+            {
+                "t": t,
+                "joints": [
+                    {"name": n, "q": x} for n, x in zip(NAMES, each, strict=True)
+                ],
+            }
+            for t, each in zip(TIME.tolist(), Q.tolist(), strict=True)
+        ]
+        rows[5]["joints"][0]["q"] = None
+        content = rows if form == "rows" else {"by": "rig 2", "run": {"samples": rows}}
+        q = "joints/hip/q"
+    (tmp_path / "a.json").write_text(json.dumps(content))
+    columns = read_table(tmp_path / "a.json").columns
+    expected = Q[:, 0].copy()
+    if form != "arrays":
+        expected[5] = np.nan
+    np.testing.assert_array_equal(columns[q], expected)
+    np.testing.assert_array_equal(columns[next(iter(columns))], TIME)
+
+
+def test_a_json_with_a_number_beside_its_rows_has_the_time_of_it(tmp_path):
+    rows = [{"q": each} for each in Q.tolist()]
+    content = {"dt": 0.005, "joint_names": NAMES, "data": rows}
+    (tmp_path / "a.json").write_text(json.dumps(content))
+    columns = read_table(tmp_path / "a.json").columns
+    np.testing.assert_allclose(columns["time"], TIME, atol=1e-12)
+    np.testing.assert_array_equal(columns["q/knee"], Q[:, 1])
+
+
+@pytest.mark.parametrize("text, says", [
+    ("{", "no JSON"), ("3", "no columns"), ('{"a": "b"}', "no array of numbers"),
+    ("[" * 100_000, "no JSON"), ("[]", "no columns"),
+])  # fmt: skip
+def test_a_json_that_is_no_log_is_refused_in_a_line(tmp_path, text, says):
+    (tmp_path / "a.json").write_text(text)
+    with pytest.raises(ValueError, match=says) as error:
+        read_table(tmp_path / "a.json")
+    assert "\n" not in str(error.value)
+
+
+def test_a_folder_s_json_files_are_logs_only_where_no_other_file_is(tmp_path):
+    content = {"t": TIME.tolist(), "q": Q.tolist()}
+    (tmp_path / "run.json").write_text(json.dumps(content))
+    (tmp_path / "noise.json").write_text('{"q": 0.001}')
+    assert [p.name for p in recording_files([str(tmp_path)])] == ["run.json"]
+    np.savez(tmp_path / "b.npz", t=TIME, q=Q)
+    assert [p.name for p in recording_files([str(tmp_path)])] == ["b.npz"]

@@ -35,7 +35,7 @@ _PICKLED = (
 )
 _HDF5 = (".h5", ".hdf5", ".hdf")
 _LINES = (".jsonl", ".ndjson")
-ARRAYS = (".npz", ".npy", ".mat", *_LINES)
+ARRAYS = (".npz", ".npy", ".mat", ".json", *_LINES)
 
 Read = tuple[dict[str, np.ndarray], np.ndarray, int, list[tuple[str, str]]]
 
@@ -157,28 +157,75 @@ def read_lines(path: Path, most_cells: int, unused: frozenset[str]) -> Read:
     rows = []
     for k, line in enumerate(path.read_text(errors="replace").splitlines(), start=1):
         try:
-            rows += [dict(_leaves("", json.loads(line)))] if line.strip() else []
+            rows += [json.loads(line)] if line.strip() else []
         except ValueError as error:
             raise ValueError(f"recording {path}, line {k}: {error}") from None
-    names = [
-        n for n in dict.fromkeys(n for row in rows for n in row) if n not in unused
-    ]
+    return _of_rows(path, rows, {}, most_cells, unused)
+
+
+def read_json(path: Path, most_cells: int, unused: frozenset[str]) -> Read:
+    """The same of one JSON document: arrays by name, or the longest list of objects in
+    it, an object a row.
+
+    Raises: ValueError, one line.
+    """
+    try:
+        content = json.loads(path.read_text(errors="replace"))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"recording {path} is no JSON: {error}") from None
+    rows = max(_lists_of_objects(content), key=len, default=[])
+    return _of_rows(path, rows, _without(content, rows), most_cells, unused)
+
+
+def _lists_of_objects(value) -> Iterator[list]:
+    """Those with enough rows for a log, wherever they are in a document."""
+    if isinstance(value, list):
+        if len(value) >= FEWEST and all(isinstance(each, dict) for each in value):
+            yield value
+            return
+    elif isinstance(value, dict):
+        value = list(value.values())
+    for each in value if isinstance(value, list) else []:
+        if isinstance(each, dict | list):
+            yield from _lists_of_objects(each)
+
+
+def _without(value, rows: list):
+    """A document less one of its lists."""
+    if value is rows:
+        return {}
+    if isinstance(value, dict):
+        return {k: _without(each, rows) for k, each in value.items()}
+    return value
+
+
+def _of_rows(
+    path: Path, rows: Sequence, beside, most_cells: int, unused: frozenset[str]
+) -> Read:
+    """A table of rows of names and values, with what is said once beside them."""
+    flat = [dict(_leaves("", row)) for row in rows]
+    once = {k: v for k, v in _leaves("", beside) if k}
+    names = [*dict.fromkeys(n for row in flat for n in row), *once]
 
     def load(name: str):
-        each = [row.get(name) for row in rows]
-        some = np.asarray(next(x for x in each if x is not None))
+        if name in once:
+            each = [once[name]]
+        else:
+            each = [row.get(name) for row in flat]
+        some = np.asarray(next((x for x in each if x is not None), np.nan))
         none = np.full(some.shape, np.nan)
         try:
             return np.array([none if x is None else x for x in each])
         except ValueError:
             return None
 
+    names = [n for n in dict.fromkeys(names) if n not in unused]
     return _table(path, names, load, most_cells)
 
 
 READERS = {
     ".npz": read_npz, ".npy": read_npy, ".mat": read_mat,
-    **dict.fromkeys(_LINES, read_lines),
+    ".json": read_json, **dict.fromkeys(_LINES, read_lines),
 }  # fmt: skip
 
 

@@ -39,8 +39,11 @@ def recording_files(words: Iterable[str]) -> list[Path]:
 
 
 def recordings_in(folder: Path) -> list[Path]:
-    """The logs that lie in a folder."""
-    return sorted(path for path in folder.iterdir() if is_recording(path))
+    """The logs that lie in a folder; files of JSON, which are calibrations and settings
+    as well, only where no other file is one."""
+    found = sorted(path for path in folder.iterdir() if is_recording(path))
+    logs = [path for path in found if path.suffix.lower() != ".json"]
+    return logs or [path for path in found if path.name != "noise.json"]
 
 
 def is_recording(path: Path) -> bool:

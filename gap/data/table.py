@@ -53,7 +53,7 @@ ANGLES = "roll pitch yaw".split()  # Of a pose, in the place of a quaternion.
 QUANTITIES = frozenset([*JOINT_QUANTITIES, *POSE, *ANGLES, *TWIST, *WRENCH])
 _TEXTS = (".csv", ".txt", ".tsv", ".dat")
 FORMATS = (".csv", ".npz", ".parquet")  # In which tables are written.
-_READ = ".csv, .txt, .tsv, .dat (.gz), .npz, .npy, .mat, .jsonl, .parquet"
+_READ = ".csv, .txt, .tsv, .dat (.gz), .npz, .npy, .mat, .json, .jsonl, .parquet"
 
 # More numbers than this are not kept in memory (320 MB): 3.6 h of 14 channels at
 # 200 Hz. Of a longer table, evenly spread stretches of rows are.
