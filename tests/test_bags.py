@@ -110,6 +110,61 @@ def test_a_bag_is_read_with_its_stamps_names_and_rates(tmp_path, rosbags, ros, k
             np.testing.assert_array_equal(np.abs(u), 0.1 * np.arange(N)[::2])
 
 
+CONTROLLER = """
+std_msgs/Header header
+string[] joint_names
+rig_msgs/Point desired
+rig_msgs/Values[] interface_values
+rig_msgs/Motor[] motors
+float64[3] wrench
+"""
+OTHERS = {
+    "Point": "float64[] positions\nfloat64[] effort",
+    "Values": "string[] interface_names\nfloat64[] values",
+    "Motor": "string name\nfloat32 temperature",
+}
+
+
+@pytest.mark.parametrize("names", [JOINTS, ["shoulder", ""], ["elbow", "elbow"]])
+def test_names_in_a_message_are_those_of_arrays_of_as_many(tmp_path, rosbags, names):
+    """As in states of ros2_control: in the order of the controller, not the robot's.
+    Names that are empty, or come twice, name nothing."""
+    from rosbags import rosbag2
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    for name, text in {"State": CONTROLLER, **OTHERS}.items():
+        store.register(get_types_from_msg(text, f"rig_msgs/msg/{name}"))
+    types = {name: store.types[f"rig_msgs/msg/{name}"] for name in ("State", *OTHERS)}
+    plugin = rosbag2.StoragePlugin.MCAP
+    Header = store.types["std_msgs/msg/Header"]
+    Time = store.types["builtin_interfaces/msg/Time"]
+    with rosbag2.Writer(tmp_path / "bag", version=9, storage_plugin=plugin) as writer:
+        to = writer.add_connection("/rig", "rig_msgs/msg/State", typestore=store)
+        for k in range(N):
+            now, q = START + PERIOD * k, np.array([position(T[k], j) for j in (0, 1)])
+            each = [types["Values"](["position", "effort"], x * np.array([1.0, 2.0]))
+                    for x in q]  # fmt: skip
+            motors = [types["Motor"](name, 20.0 + j) for j, name in enumerate(names)]
+            message = types["State"](
+                Header(Time(now // 10**9, now % 10**9), ""), names,
+                types["Point"](q, np.zeros(0)), each, motors, np.arange(3.0),
+            )  # fmt: skip
+            raw = store.serialize_cdr(message, "rig_msgs/msg/State")
+            writer.write(to, now, raw)
+    columns = read_table(tmp_path / "bag").columns
+    if names != JOINTS:
+        at = ["/rig/desired/positions[1]", "/rig/interface_values[1]/effort/values",
+              "/rig/motors[1]/temperature"]  # fmt: skip
+    else:
+        at = ["/rig/desired/elbow/positions", "/rig/elbow/interface_values/effort/"
+              "values", "/rig/elbow/motors/temperature"]  # fmt: skip
+    expected = position(T, 1), 2.0 * position(T, 1), np.full(N, 21.0)
+    for name, values in zip(at, expected, strict=True):
+        np.testing.assert_allclose(columns[name], values, err_msg=name)
+    assert "/rig/wrench[2]" in columns and len(columns) == 1 + 2 + 4 + 2 + 3
+
+
 def test_a_bag_that_is_none_is_refused_in_one_line(tmp_path, rosbags):
     for name in ("a.bag", "a.mcap", "a.db3"):
         (tmp_path / name).write_bytes(b"no bag" * 100)

@@ -1,10 +1,10 @@
 """ROS bags (1, 2, MCAP) and LeRobot v3 datasets as tables of numbers.
 
-A bag's numbers get the names <topic>/<joint>/position, /velocity, /effort of a
-sensor_msgs/JointState, and <topic>/<field> of anything else, arrays as <field>[0], ...;
-time is the header's stamp, where a message has one, else when it was recorded. Each
-message is a row, so that topics keep their own rates. A dataset's columns get the names
-of its features, <feature>.<name>.
+A bag's numbers get the names <topic>/<field>, those of an array <field>[0], ...; or,
+where a list of names in the message has as many, <topic>/<name>/<field>, as
+<topic>/<joint>/position of a sensor_msgs/JointState. Time is the header's stamp, where
+a message has one, else when it was recorded. Each message is a row, so that topics keep
+their own rates. A dataset's columns get the names of its features, <feature>.<name>.
 """
 
 import json
@@ -18,7 +18,6 @@ import numpy as np
 BAGS = (".bag", ".mcap", ".db3")
 TICKS = 4096  # A turn of a LeRobot arm's motor.
 LONGEST_ARRAY = 64  # Longer ones are pictures, maps, clouds.
-_JOINT_STATE = "sensor_msgs/msg/JointState"
 # What is only shown: it says again what other topics say.
 _DRAWN = ("visualization_msgs/", "tf2_msgs/")
 _TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
@@ -170,37 +169,59 @@ def _stamp(message) -> int:
 
 
 def _numbers(topic: str, kind: str, message) -> Iterator[tuple[str, float]]:
-    if kind == _JOINT_STATE:
-        for what in ("position", "velocity", "effort"):
-            values = getattr(message, what)
-            if len(values) == len(message.name):
-                for name, value in zip(message.name, values, strict=True):
-                    yield f"{topic}/{name}/{what}", float(value)
-        return
     if kind == _TRAJECTORY:  # What is to be reached first.
         if message.points:
-            point = message.points[0]
-            for what in ("positions", "velocities", "effort"):
-                values = getattr(point, what)
-                if len(values) == len(message.joint_names):
-                    for name, value in zip(message.joint_names, values, strict=True):
-                        yield f"{topic}/{name}/{what}", float(value)
+            yield from _fields(topic, message.points[0], 0, _labels_in(message))
         return
-    yield from _fields(topic, message, 0)
+    yield from _fields(topic, message, 0, {})
 
 
-def _fields(name: str, value, depth: int) -> Iterator[tuple[str, float]]:
-    """All numbers below a value."""
+def _fields(
+    name: str, value, depth: int, labels: dict[int, list[str]]
+) -> Iterator[tuple[str, float]]:
+    """All numbers below a value. labels: {length: names of the entries of arrays of
+    this length}."""
     if isinstance(value, bool | int | float | np.number):
         yield name, float(value)
     elif isinstance(value, np.ndarray | list | tuple):
-        if len(value) <= LONGEST_ARRAY:
-            for i, each in enumerate(value):
-                yield from _fields(f"{name}[{i}]", each, depth + 1)
+        if not 0 < len(value) <= LONGEST_ARRAY:
+            return
+        own = _distinct([_own_name(each) for each in value])
+        above, _, key = name.rpartition("/")
+        for i, each in enumerate(value):
+            at = f"{name}[{i}]"
+            if label := (own or labels.get(len(value), {}) or [""] * len(value))[i]:
+                at = f"{above}/{label}/{key}"
+            yield from _fields(at, each, depth + 1, labels)
     elif depth < 4 and hasattr(value, "__dataclass_fields__"):
+        labels = labels | _labels_in(value)
         for key in value.__dataclass_fields__:
             if key not in ("header", "layout") and not key.startswith("__"):
-                yield from _fields(f"{name}/{key}", getattr(value, key), depth + 1)
+                yield from _fields(f"{name}/{key}", getattr(value, key), depth + 1,
+                                   labels)  # fmt: skip
+
+
+def _labels_in(message) -> dict[int, list[str]]:
+    """{length: names} of the lists of names in a message: those of joints, beside which
+    arrays of as many numbers or messages are."""
+    found: dict[int, list[str]] = {}
+    for key in message.__dataclass_fields__:
+        value = getattr(message, key)
+        if isinstance(value, list) and (names := _distinct(value)):
+            found.setdefault(len(names), names)
+    return found
+
+
+def _own_name(message) -> str | None:
+    """What a message of a list is called, if it says so."""
+    each = (getattr(message, key, None) for key in ("name", "joint_name"))
+    return next((x for x in each if isinstance(x, str)), None)
+
+
+def _distinct(names: list) -> list[str]:
+    """The names, or none where one is no text, is empty or comes twice."""
+    is_text = all(isinstance(each, str) and each for each in names)
+    return names if is_text and len(set(names)) == len(names) else []
 
 
 def _table(stamps: np.ndarray, rows: list[dict[str, float]]) -> dict[str, np.ndarray]:
