@@ -8,7 +8,7 @@ their own rates. A dataset's columns get the names of its features, <feature>.<n
 """
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -186,12 +186,11 @@ def _fields(
     elif isinstance(value, np.ndarray | list | tuple):
         if not 0 < len(value) <= LONGEST_ARRAY:
             return
-        own = _distinct([_own_name(each) for each in value])
+        names = _distinct([_own_name(each) for each in value])
+        names = names or labels.get(len(value), [])
         above, _, key = name.rpartition("/")
         for i, each in enumerate(value):
-            at = f"{name}[{i}]"
-            if label := (own or labels.get(len(value), {}) or [""] * len(value))[i]:
-                at = f"{above}/{label}/{key}"
+            at = f"{above}/{names[i]}/{key}" if names else f"{name}[{i}]"
             yield from _fields(at, each, depth + 1, labels)
     elif depth < 4 and hasattr(value, "__dataclass_fields__"):
         labels = labels | _labels_in(value)
@@ -218,10 +217,10 @@ def _own_name(message) -> str | None:
     return next((x for x in each if isinstance(x, str)), None)
 
 
-def _distinct(names: list) -> list[str]:
+def _distinct(names: Sequence[str | None]) -> list[str]:
     """The names, or none where one is no text, is empty or comes twice."""
-    is_text = all(isinstance(each, str) and each for each in names)
-    return names if is_text and len(set(names)) == len(names) else []
+    texts = [each for each in names if isinstance(each, str) and each]
+    return texts if len(set(texts)) == len(names) else []
 
 
 def _table(stamps: np.ndarray, rows: list[dict[str, float]]) -> dict[str, np.ndarray]:
