@@ -34,16 +34,21 @@ from makebreak.systems.arm.numerics.packed import packed
 from makebreak.systems.arm.numerics.serial_chain import chain_state
 from makebreak.systems.numerics.first_calls import deferred
 
-PLANT = make_control_plant()
-with deferred():  # Nothing is compiled while tests are collected.
-    LAW = ImpedanceController(ImpedanceConfig(), PLANT)._law
-CHAIN = serial_chain_of(PLANT, "tip")
-PACKED_CHAIN = packed(CHAIN)
-V = SPEED_SHARE * LAW.speed_max
-TICK = LAW.period
-NO_LIMITS = LAW._replace(
-    speed_max=np.full(7, np.inf), q_lower=np.full(7, -99.0), q_upper=np.full(7, 99.0)
-)
+TICK = ImpedanceConfig().period_sec
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _arm():
+    """Made here, as nothing is to be compiled while tests are collected."""
+    global CHAIN, PACKED_CHAIN, LAW, NO_LIMITS, V
+    plant = make_control_plant()
+    CHAIN = serial_chain_of(plant, "tip")
+    PACKED_CHAIN = packed(CHAIN)
+    with deferred():
+        LAW = ImpedanceController(ImpedanceConfig(), plant)._law
+    infinite = {"q_lower": np.full(7, -99.0), "q_upper": np.full(7, 99.0)}
+    NO_LIMITS = LAW._replace(speed_max=np.full(7, np.inf), **infinite)
+    V = SPEED_SHARE * LAW.speed_max
 
 
 def one_joint(mass, effort, rate, q_upper=99.0):

@@ -372,16 +372,20 @@ def loss(at, row=0):
 
 
 WALL = dict(force_directions=[AHEAD], force_targets=[5.0])
-UP = MotionPattern((
-    Segment("line", [[0.6, 0, 0.05], [0.6, 0, 0.2]], (0.0, 1.2), **WALL),
-    Segment("line", [[0.6, 0, 0.2], [0.6, 0, 0.3]], (1.2, 2.1)),
-    Segment("line", [[0.6, 0, 0.3], [0.6, 0.2, 0.3]], (2.1, 4.1)),
-))  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def up():
+    return MotionPattern((
+        Segment("line", [[0.6, 0, 0.05], [0.6, 0, 0.2]], (0.0, 1.2), **WALL),
+        Segment("line", [[0.6, 0, 0.2], [0.6, 0, 0.3]], (1.2, 2.1)),
+        Segment("line", [[0.6, 0, 0.3], [0.6, 0.2, 0.3]], (2.1, 4.1)),
+    ))  # fmt: skip
 
 
 @pytest.mark.parametrize("at", [0.8, 1.2, 1.5])
-def test_the_loss_of_a_contact_starts_the_next_segment_without_a_stop(at):
-    log = follow(UP, ContactBelief(), law=FADES, feel=loss(at))
+def test_the_loss_of_a_contact_starts_the_next_segment_without_a_stop(at, up):
+    log = follow(up, ContactBelief(), law=FADES, feel=loss(at))
     first = np.flatnonzero(log.segment == 1)[0]
     assert log.t[first] == pytest.approx(at, abs=2 * DT)
     np.testing.assert_allclose(log.speed[first], log.speed[first - 1], atol=1e-3)
@@ -390,8 +394,8 @@ def test_the_loss_of_a_contact_starts_the_next_segment_without_a_stop(at):
     np.testing.assert_allclose(log.p[-1], [0.6, 0.2, 0.3], atol=1e-12)
 
 
-def test_a_loss_that_does_not_come_is_waited_for_up_to_the_limit():
-    log = follow(UP, ContactBelief())
+def test_a_loss_that_does_not_come_is_waited_for_up_to_the_limit(up):
+    log = follow(up, ContactBelief())
     first = np.flatnonzero(log.segment == 1)[0]
     assert log.p[first, 2] == pytest.approx(0.2 + LAW.search_max, abs=1e-3)
 
@@ -529,8 +533,8 @@ def test_while_the_force_sensor_fails_the_motion_pauses(fault):
     np.testing.assert_allclose(log.p[-1], [0.5, 0, 0.3], atol=2e-3)
 
 
-def test_a_pose_that_is_nan_at_a_release_is_not_used():
-    log = follow(UP, ContactBelief(), feel=loss(0.8), pose=lambda t, p: p * np.nan)
+def test_a_pose_that_is_nan_at_a_release_is_not_used(up):
+    log = follow(up, ContactBelief(), feel=loss(0.8), pose=lambda t, p: p * np.nan)
     assert np.all(np.isfinite(log.X)) and log.stage[-1] == DONE
 
 
