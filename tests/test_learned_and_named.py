@@ -70,6 +70,8 @@ def learned_and_recorded(task, true, folder):
         parameters=items,
     )  # fmt: skip
     config.options = replace(config.options, N=task.N)
+    if task.tuned:
+        config = mb.tuned(config, plant, **task.tuned)
     mpc = builder.AddSystem(mb.make_contact_mpc(model, config))
     learner = builder.AddSystem(
         mb.ParameterLearner(

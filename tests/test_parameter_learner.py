@@ -359,6 +359,11 @@ def test_only_what_is_certain_is_acted_on():
     ratio = Belief(1.4 * d, np.eye(2) + 1e6 * np.outer(d, d))
     assert (ratio.std > 0.7).all()
     np.testing.assert_allclose(certain_part(ratio), 1.4 * d, atol=1e-5)
+    # A mass and a gap known equally well (a leg that stands): the gap stays.
+    apart = Belief(np.array([1.38, -0.015]), np.array([[214.0, -0.7], [-0.7, 212.0]]))
+    mass, gap = certain_part(apart)
+    assert gap == 0.0
+    assert mass == pytest.approx(1.38 - 1.0 / (214.0 * 1.38), abs=1e-4)
 
 
 def test_drift_forgets_but_never_below_the_model():

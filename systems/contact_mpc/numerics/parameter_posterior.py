@@ -464,11 +464,19 @@ def drifted(belief: Belief, variance) -> Belief:
 def certain_part(belief: Belief) -> np.ndarray:
     """z (n,) to act on: the mean, less where it is not known.
 
-    Along each principal direction of the belief the mean a with deviation s is taken
-    (1 - s^2 / a^2) times, within one deviation of the model's value not at all. So a
-    ratio of two parameters that is known is acted on though neither of them is.
+    What is within one deviation of the model's value, were all others known, stays
+    there. Given this, along each principal direction of the others' belief the mean a
+    with deviation s is taken (1 - s^2 / a^2) times, within one deviation not at all. So
+    a ratio of two parameters that is known is acted on though neither of them is; and
+    what is known equally well, but has nothing to do with each other, stays apart:
+    principal directions alone would mix it.
     """
-    information, directions = np.linalg.eigh(belief.information)
-    along = directions.T @ belief.mean
+    z, known = np.zeros(len(belief.mean)), belief.information
+    changed = np.diag(known) * belief.mean**2 > 1.0
+    information, directions = np.linalg.eigh(known[np.ix_(changed, changed)])
+    along = directions.T @ np.linalg.solve(
+        known[np.ix_(changed, changed)], (known @ belief.mean)[changed]
+    )
     share = 1.0 - 1.0 / np.maximum(information * along**2, 1.0)
-    return directions @ (share * along)
+    z[changed] = directions @ (share * along)
+    return z
