@@ -208,22 +208,27 @@ def of_experiment(name, seed, settings, out):
 
 @pytest.mark.slow
 def test_a_pushed_object_s_frictions_agree(tmp_path):
-    """Four goals, with half the friction in the model. The finger hardly slides: the
-    learner is not sure of it, and `gap` may leave it out."""
+    """Four goals, with half the friction in the model. Pushes tell the product of the
+    table's friction and the mass; how it is divided has wide intervals, of which one
+    in ten does not hold."""
     wrong = ["n_goals=4", "model.friction=0.25"]
     learned, result = of_experiment("push_object", 26200, wrong, tmp_path / "run")
     found = {
         e.at[0].rpartition(".")[2]: e.parameters["friction"]
         for e in result.effects if e.kind == "contact_friction"
     }  # fmt: skip
-    assert "table" in found and len(result.effects) == len(found), result.says
+    assert found.keys() == {"table", "finger"}, result.says
+    assert len(result.effects) == 2, result.says
     for of, pairs in (("finger", "0"), ("table", "1_2_3")):
         low, high = (learned[f"learned_friction_of_pairs_{pairs}_{end}"]
                      for end in ("low", "high"))  # fmt: skip
-        assert low <= 0.5 <= high
-        if its := found.get(of):
-            assert low - NINETY * its.std <= its.value <= high + NINETY * its.std
-            assert its.value == pytest.approx(0.5, rel=0.1)
+        its = found[of]
+        assert low - NINETY * its.std <= its.value <= high + NINETY * its.std
+        assert its.value == pytest.approx(0.5, rel=0.1)
+    product = (
+        learned["learned_friction_of_pairs_1_2_3"] * learned["learned_mass_of_object"]
+    )
+    assert product == pytest.approx(0.5 * 0.4, rel=0.1)
 
 
 @pytest.mark.slow
