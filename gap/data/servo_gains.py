@@ -2,11 +2,14 @@
 
 A servo gives kp (command - position) - kd velocity. Where measured efforts are just
 that, they tell the gains. Else the robot needs what inverse dynamics says. Both are
-averaged by one kernel and compared by least squares, with dry friction and a rotor
-free, so that neither is taken for a gain.
+averaged by one kernel and compared by least squares, with dry friction free, and, where
+there is evidence for it, rotors of all joints, and by how much commands act later, or
+earlier, than in their rows: none of these is then taken for a gain. (A joint that
+nothing weighs on moves alike with twice the gains and twice the inertia; and commands
+that are late look like damping and a rotor.)
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -26,8 +29,9 @@ PARTS = 5  # Of the data: each is predicted from the others,
 LARGEST_SPREAD = 0.15  # whose stiffnesses differ by less than this share (1 sigma),
 LEAST_EXPLAINED = 0.8  # and of what the rest leaves the stiffness explains this.
 LAW_LEAVES = 0.01  # Of the variance of an effort that is what its servo gives.
-# Commands are late where the laws' evidence (half a chi-square; rows KERNEL_SEC apart
-# count as independent) grows by so much; at most so late [s].
+# Commands are late, and joints have rotors, where the laws' evidence (half a
+# chi-square; rows KERNEL_SEC apart count as independent) grows by so much; at most so
+# late [s].
 LATE_EVIDENCE, MOST_LATE = 10.0, 0.1
 BETWEEN = 0.1  # Of a row: commands that are so much later than one do not hold for it.
 NOTHING = 1e-12  # Of a variance: rounding leaves so much.
@@ -72,10 +76,12 @@ def servo_gains(
 
     Args: plant: a finalized mechanism, all of whose coordinates are in `motions`.
     """
-    parts: list[list[tuple]] = [[] for _ in range(plant.num_positions())]
+    moving: list[list[_Moving]] = [[] for _ in range(plant.num_positions())]
     for motion in motions:
-        for own, rows in zip(parts, _equations(plant, motion), strict=True):
-            own.append(rows)
+        for own, one in zip(moving, _moving(plant, motion), strict=True):
+            own.append(one)
+    with_rotors, late = _most_likely(moving)
+    parts = [[one.rows(late, with_rotors) for one in own] for own in moving]
     found = [_fitted(own) for own in parts]
     slides = [j.type_name() == "prismatic" for j in _joints(plant)]
     for i, own in enumerate(parts):
@@ -86,6 +92,69 @@ def servo_gains(
         if found[i] is None and alike:
             found[i] = _fitted_at(float(np.median(alike)), own)
     return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Moving:
+    """Of one joint, while it moves, at times t (m,) [s]: means by the kernel of its
+    position (m,), rate (m,) and acceleration (m,), and the effort that the robot needs
+    (m,). told (n, 2): times and means of its command, as each holds from its row on;
+    step [s] of these."""
+
+    t: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+    vd: np.ndarray
+    needed: np.ndarray
+    told: np.ndarray
+    step: float
+
+    def rows(self, late: float, with_rotor: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Regressors (m, 4) of kp, kd, friction and rotor, and effort (m,), of commands
+        that are so late [s]."""
+        told = np.interp(self.t - late, *self.told.T)
+        v, vd = self.v, self.vd if with_rotor else 0.0 * self.vd
+        X = np.stack([told - self.q, -v, -np.sign(v), -vd], axis=1)
+        return X, self.needed
+
+
+def _most_likely(moving: Sequence[Sequence[_Moving]]) -> tuple[bool, float]:
+    """Whether joints have rotors that the plant lacks, and how late commands act [s]:
+    neither without evidence."""
+    step = min((one.step for own in moving for one in own), default=0.0)
+
+    def cost(with_rotors: bool, late: float) -> float:
+        total = 0.0
+        for own in moving:
+            every = [one.rows(late, with_rotors) for one in own if len(one.t)]
+            if not every:
+                continue
+            X, y = (np.concatenate(each) for each in zip(*every, strict=True))
+            left = nnls(X / _size(X), y)[1] ** 2
+            share = max(left / max(float(y @ y), 1e-300), NOTHING)
+            seconds = sum(len(one.t) * one.step for one in own)
+            total += 0.5 * seconds / KERNEL_SEC * float(np.log(share))
+        return total
+
+    found = []
+    for rotors in (False, True):
+        some = np.arange(-step, MOST_LATE, step) if step else np.zeros(1)
+        each = [cost(rotors, late) for late in some]
+        k = int(np.argmin(each))
+        late, least = float(some[k]), each[k]
+        if step:
+            around = (late - step, late + step)
+            best = minimize_scalar(
+                partial(cost, rotors), bounds=around, method="bounded"
+            )
+            if best.fun < least:
+                late, least = float(best.x), float(best.fun)
+        found += [
+            (cost(rotors, 0.0) + LATE_EVIDENCE * rotors, rotors, 0.0),
+            (least + LATE_EVIDENCE * (rotors + 1), rotors, late),
+        ]
+    _, with_rotors, late = min(found)
+    return with_rotors, late
 
 
 def gains_of_efforts(
@@ -204,7 +273,7 @@ def _law(
         parted = LAW_OFF**2 * kp**2 * np.sum(X[:, 0] ** 2)
         if left < max(LAW_LEAVES * whole, parted):
             return max(left / whole, NOTHING), ServoGains(kp, kd, 0.0, 0.0)
-    size = np.maximum(np.sqrt(np.mean(X**2, axis=0)), 1e-12)
+    size = _size(X)
     c, root = nnls(X / size, y)
     kp, *rates = c / size
     left = max(float(root**2) / whole, NOTHING)
@@ -219,32 +288,38 @@ def _joints(plant: MultibodyPlant) -> list:
     return sorted(one_dof_joints(plant), key=lambda joint: joint.position_start())
 
 
-def _equations(plant: MultibodyPlant, motion: ServoLog):
-    """Of each joint the regressors (m, 4) of kp, kd, friction and rotor, and the effort
-    that the robot needs (m,), while it moves; all averaged by one kernel."""
-    t, n = motion.time, motion.q.shape[1]
-    none = (np.zeros((0, 4)), np.zeros(0))
-    averaged = averaged_motion(motion)
+def _moving(plant: MultibodyPlant, motion: ServoLog) -> Iterator[_Moving]:
+    """Of each joint what it did while it moved; nothing where a log is too short, or no
+    command was given."""
+    t, averaged = motion.time, averaged_motion(motion)
     if averaged is None:
-        return [none] * n
+        none = np.zeros(0)
+        for _ in motion.command.T:
+            yield _Moving(none, none, none, none, none, np.zeros((1, 2)), np.inf)
+        return
     even, step, width, kernels, (mean, rate, rate2) = averaged
-    some = slice(None, None, max(len(mean) // MOST_SAMPLES, 1))
+    at = even[width // 2 : width // 2 + len(mean)]
+    stride = max(len(mean) // MOST_SAMPLES, 1)
+    some = np.arange(len(mean))[::stride]
     needed = needed_efforts(plant, mean[some], rate[some], rate2[some])
-    out = []
     for i, command in enumerate(motion.command.T):
         there = np.flatnonzero(np.isfinite(command))
-        if len(there) < 2:
-            out.append(none)
-            continue
-        told = np.convolve(
-            _mean_held(t[there], command[there], even, step), kernels[0], "valid"
-        )
-        v = rate[:, i]
-        X = np.stack([told - mean[:, i], -v, -np.sign(v), -rate2[:, i]], axis=1)
-        moves = np.abs(v) > MOVES * np.quantile(np.abs(v), 0.95)
-        moves = minimum_filter1d(moves, width)[some]
-        out.append((X[some][moves], needed[moves, i]))
-    return out
+        told = np.zeros(len(at))
+        moves = np.zeros(len(at), bool)
+        if len(there) > 1:
+            held = _mean_held(t[there], command[there], even, step)
+            told = np.convolve(held, kernels[0], "valid")
+            v = np.abs(rate[:, i])
+            moves = v > MOVES * np.quantile(v, 0.95)
+            moves = minimum_filter1d(moves, width)
+            # Commands from before the first row are not known.
+            moves &= (at > at[0] + MOST_LATE) & (at < at[-1] - step)
+        own = moves[some]
+        k = some[own]
+        yield _Moving(
+            at[k], mean[k, i], rate[k, i], rate2[k, i], needed[own, i],
+            np.stack([at, told], axis=1), step * stride,
+        )  # fmt: skip
 
 
 def averaged_motion(motion: ServoLog):
@@ -324,12 +399,16 @@ def needed_efforts(plant: MultibodyPlant, q, v, vd) -> np.ndarray:
     return out
 
 
+def _size(X: np.ndarray) -> np.ndarray:
+    return np.maximum(np.sqrt(np.mean(X**2, axis=0)), 1e-12)
+
+
 def _fitted(parts: Sequence[tuple[np.ndarray, np.ndarray]]) -> ServoGains | None:
     """From equations (m, 4), (m,) of each log, if parts of them agree."""
     X, y = (np.concatenate(each) for each in zip(*parts, strict=True))
     if len(y) < 10 * PARTS:
         return None
-    size = np.maximum(np.sqrt(np.mean(X**2, axis=0)), 1e-12)
+    size = _size(X)
 
     def fit(rows: np.ndarray, columns: Sequence[int]) -> np.ndarray:
         c = np.zeros(X.shape[1])
@@ -359,7 +438,7 @@ def _fitted_at(kp: float, parts: Sequence[tuple[np.ndarray, np.ndarray]]):
     if len(y) < 10 * PARTS:
         return None
     given = kp * X[:, 0] - y
-    size = np.maximum(np.sqrt(np.mean(X[:, 1:] ** 2, axis=0)), 1e-12)
+    size = _size(X[:, 1:])
     c, left = nnls(-X[:, 1:] / size, given)
     if left**2 > (1.0 - LEAST_EXPLAINED) * float(given @ given):
         return None
