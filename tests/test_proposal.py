@@ -21,6 +21,8 @@ from makebreak.gap.data.servo_gains import (
     _fitted_at,
     gains_of_efforts,
     go_in_lines,
+    needed_efforts,
+    servo_gains,
 )
 from makebreak.gap.simulation.scene_simulation import SceneSimulation
 from makebreak.models.dynamics import SceneDynamics
@@ -568,6 +570,55 @@ def test_a_servo_is_proposed_with_the_gains_that_its_motion_tells(
     assert scene.tolerance == {"drive_gains": 0.05} and not proposal.findings()
     assert "# [N/m], " in proposal.scene and "# [N s/m], " in proposal.scene
     assert scene.actuation.limit == [taken]
+
+
+@pytest.mark.parametrize("rotor", [0.0, 1.5])
+@pytest.mark.parametrize("late, rows", [(0.0, 1), (-0.005, 10), (0.016, 1)])
+def test_gains_of_motion_are_not_those_of_late_commands_or_rotors(
+    tmp_path, late, rows, rotor
+):
+    """A slide, which nothing weighs on, and a pendulum, solved finely: commands that
+    act late, or whose loop is ten times as fast as the log, look like damping, and a
+    rotor of the slide like a smaller stiffness."""
+    (tmp_path / "rig.urdf").write_text(
+        """<robot name="rig"><link name="base"/>
+        <link name="cart"><inertial><mass value="4"/>
+          <inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>
+        </link><joint name="slide" type="prismatic"><parent link="base"/>
+          <child link="cart"/><axis xyz="1 0 0"/><limit effort="99" velocity="9"/>
+        </joint><link name="bob"><inertial><origin xyz="0 0 -0.3"/><mass value="0.5"/>
+          <inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial>
+        </link><joint name="swing" type="continuous"><parent link="cart"/>
+          <child link="bob"/><axis xyz="0 1 0"/></joint></robot>"""
+    )
+    plant = read_robot(tmp_path / "rig.urdf").plant
+    kp, kd = np.array([900.0, 20.0]), np.array([60.0, 1.2])
+    step, row = 5e-4, 0.01
+
+    def told(t):
+        held = row / rows * np.floor((t - max(late, 0.0)) / (row / rows) + 1e-9)
+        return np.array([0.2 * np.sin(2.0 * held) + 0.1 * np.sin(5.0 * held),
+                         0.5 * np.sin(3.0 * held + 1.0)])  # fmt: skip
+
+    context = plant.CreateDefaultContext()
+    q, v, states = told(0.0), np.zeros(2), []
+    for k in range(int(15.0 / step)):
+        states.append(q)
+        u = kp * (told(k * step) - q) - kd * v
+        bias = needed_efforts(plant, q[None], v[None], np.zeros((1, 2)))[0]
+        plant.SetPositions(context, q)
+        M = plant.CalcMassMatrix(context) + np.diag([rotor, 0.0])
+        # By the middle of a step: a velocity half a step late would be another rotor.
+        vd = np.linalg.solve(M + 0.5 * step * np.diag(kd), u - bias)
+        q, v = q + step * (v + 0.5 * step * vd), v + step * vd
+    every = round(row / step)
+    t = row * np.arange(len(states[::every]))
+    command = np.stack([told(at + max(late, 0.0)) for at in t])
+    log = ServoLog(t, np.array(states[::every]), command)
+    found = servo_gains(plant, [log])
+    np.testing.assert_allclose([g.kp for g in found], kp, rtol=0.01)
+    np.testing.assert_allclose([g.kd for g in found], kd, rtol=0.02)
+    np.testing.assert_allclose([g.rotor for g in found], [rotor, 0.0], atol=0.03)
 
 
 def test_of_a_servo_that_needs_no_effort_the_rest_goes_with_its_stiffness():

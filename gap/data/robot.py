@@ -1036,7 +1036,7 @@ def _actuation(judged: Judged, kinds, logs, notes: list[str]) -> tuple[list[str]
         if every_one and not servos:
             lines.append(f"tolerance: {{drive_gains: {GAINS_KNOWN_TO}}}")
         # A geared motor's own inertia is what its back-EMF and its spring work on.
-        rotors, moved = [], _inertia(robot)
+        rotors, shown, moved = [], [], _inertia(robot)
         slides = {j.name: j.prismatic for j in robot.joints}
         for joint, k in zip(joints, kd, strict=True):
             inertia = gains[joint].rotor if joint in gains else ROTOR_SEC * k
@@ -1044,13 +1044,20 @@ def _actuation(judged: Judged, kinds, logs, notes: list[str]) -> tuple[list[str]
             if any((e.kind, e.at) == own for e in robot.file.effects):
                 continue
             if joint not in gains or inertia > LEAST_ROTOR * moved[joint]:
+                unit, inertia = unit_at("kg m2", slides[joint]), float(f"{inertia:.2g}")
                 rotors.append(
                     f"- {{kind: rotor_inertia, at: {joint}, "
-                    f"parameters: {{inertia: {float(f'{inertia:.2g}')}}}}}  "
-                    f"# [{unit_at('kg m2', slides[joint])}]"
+                    f"parameters: {{inertia: {inertia}}}}}  # [{unit}]"
                 )
+                if joint in gains:
+                    shown.append(f"{inertia} {unit} at {joint}")
         if rotors:
             lines += ["effects:  # Rotors of the servos' motors, a guess.", *rotors]
+        if shown:
+            notes.append(
+                f"{robot.path.name} lacks inertia of their motors that the motion "
+                f"shows: {', '.join(shown)}"
+            )
         return lines, "" if every_one else told
     if joints := named("velocity_command"):
         notes.append("drives follow velocities, with gains that are a guess")

@@ -12,6 +12,8 @@ that are late look like damping and a rotor.)
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
@@ -34,7 +36,8 @@ LAW_LEAVES = 0.01  # Of the variance of an effort that is what its servo gives.
 # late [s].
 LATE_EVIDENCE, MOST_LATE = 10.0, 0.1
 BETWEEN = 0.1  # Of a row: commands that are so much later than one do not hold for it.
-NOTHING = 1e-12  # Of a variance: rounding leaves so much.
+NOTHING = 1e-12  # Of a variance: rounding leaves so much,
+WITHIN_ROWS = 0.01  # and what happens within a row this, times (row / KERNEL_SEC)^2.
 LAW_OFF = 0.03  # Of the gains of a file, which are rather taken than those of a fit.
 
 
@@ -78,10 +81,10 @@ def servo_gains(
     """
     moving: list[list[_Moving]] = [[] for _ in range(plant.num_positions())]
     for motion in motions:
-        for own, one in zip(moving, _moving(plant, motion), strict=True):
-            own.append(one)
-    with_rotors, late = _most_likely(moving)
-    parts = [[one.rows(late, with_rotors) for one in own] for own in moving]
+        for each, one in zip(moving, _moving(plant, motion), strict=True):
+            each.append(one)
+    way = _most_likely(moving)
+    parts = [[one.rows(way) for one in each] for each in moving]
     found = [_fitted(own) for own in parts]
     slides = [j.type_name() == "prismatic" for j in _joints(plant)]
     for i, own in enumerate(parts):
@@ -94,12 +97,21 @@ def servo_gains(
     return found
 
 
+class _Way(NamedTuple):
+    """How commands act: so late [s], held from their rows on or in lines from each row
+    to the next; and whether joints have rotors that the plant lacks."""
+
+    with_rotors: bool = False
+    in_lines: bool = False
+    late: float = 0.0
+
+
 @dataclass(frozen=True, eq=False)
 class _Moving:
     """Of one joint, while it moves, at times t (m,) [s]: means by the kernel of its
     position (m,), rate (m,) and acceleration (m,), and the effort that the robot needs
-    (m,). told (n, 2): times and means of its command, as each holds from its row on;
-    step [s] of these."""
+    (m,). told (n, 3): times and means of its command, held and in lines; step [s]
+    between t."""
 
     t: np.ndarray
     q: np.ndarray
@@ -109,52 +121,51 @@ class _Moving:
     told: np.ndarray
     step: float
 
-    def rows(self, late: float, with_rotor: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Regressors (m, 4) of kp, kd, friction and rotor, and effort (m,), of commands
-        that are so late [s]."""
-        told = np.interp(self.t - late, *self.told.T)
-        v, vd = self.v, self.vd if with_rotor else 0.0 * self.vd
-        X = np.stack([told - self.q, -v, -np.sign(v), -vd], axis=1)
-        return X, self.needed
+    def rows(self, way: _Way) -> tuple[np.ndarray, np.ndarray]:
+        """Regressors (m, 4) of kp, kd, friction and rotor, and effort (m,)."""
+        told = np.interp(
+            self.t - way.late, self.told[:, 0], self.told[:, 2 if way.in_lines else 1]
+        )
+        v, vd = self.v, self.vd if way.with_rotors else 0.0 * self.vd
+        return np.stack([told - self.q, -v, -np.sign(v), -vd], axis=1), self.needed
 
 
-def _most_likely(moving: Sequence[Sequence[_Moving]]) -> tuple[bool, float]:
-    """Whether joints have rotors that the plant lacks, and how late commands act [s]:
-    neither without evidence."""
-    step = min((one.step for own in moving for one in own), default=0.0)
+def _most_likely(moving: Sequence[Sequence[_Moving]]) -> _Way:
+    """How commands act, and whether there are rotors: held from their rows on, and
+    none, without evidence."""
+    joints = [[one for one in own if len(one.t)] for own in moving]
+    joints = [own for own in joints if own]
+    if not joints:
+        return _Way()
+    row = min(float(np.diff(one.told[:2, 0])[0]) for own in joints for one in own)
 
-    def cost(with_rotors: bool, late: float) -> float:
+    def cost(way: _Way, least: float = NOTHING) -> float:
         total = 0.0
-        for own in moving:
-            every = [one.rows(late, with_rotors) for one in own if len(one.t)]
-            if not every:
-                continue
+        for own in joints:
+            every = [one.rows(way) for one in own]
             X, y = (np.concatenate(each) for each in zip(*every, strict=True))
             left = nnls(X / _size(X), y)[1] ** 2
-            share = max(left / max(float(y @ y), 1e-300), NOTHING)
+            share = max(left / max(float(y @ y), 1e-300), least)
             seconds = sum(len(one.t) * one.step for one in own)
             total += 0.5 * seconds / KERNEL_SEC * float(np.log(share))
         return total
 
-    found = []
-    for rotors in (False, True):
-        some = np.arange(-step, MOST_LATE, step) if step else np.zeros(1)
-        each = [cost(rotors, late) for late in some]
-        k = int(np.argmin(each))
-        late, least = float(some[k]), each[k]
-        if step:
-            around = (late - step, late + step)
-            best = minimize_scalar(
-                partial(cost, rotors), bounds=around, method="bounded"
-            )
-            if best.fun < least:
-                late, least = float(best.x), float(best.fun)
-        found += [
-            (cost(rotors, 0.0) + LATE_EVIDENCE * rotors, rotors, 0.0),
-            (least + LATE_EVIDENCE * (rotors + 1), rotors, late),
-        ]
-    _, with_rotors, late = min(found)
-    return with_rotors, late
+    ways = []
+    for rotors, lines in product((False, True), (False, True)):
+        by_late = partial(_Way, rotors, lines)
+        some = np.arange(-row if lines else 0.0, MOST_LATE, row)
+        late = min(some, key=lambda late: cost(by_late(late)))
+        found = minimize_scalar(
+            lambda late: cost(by_late(late)),  # noqa: B023
+            bounds=(max(late - row, some[0]), late + row), method="bounded",
+        )  # fmt: skip
+        ways += [by_late(float(found.x))] + [by_late(0.0)] * (not lines)
+
+    def against(way: _Way) -> float:
+        free = way.with_rotors + (way.in_lines or way.late != 0.0)
+        return cost(way, WITHIN_ROWS * (row / KERNEL_SEC) ** 2) + LATE_EVIDENCE * free
+
+    return min(sorted(ways), key=against)
 
 
 def gains_of_efforts(
@@ -295,7 +306,7 @@ def _moving(plant: MultibodyPlant, motion: ServoLog) -> Iterator[_Moving]:
     if averaged is None:
         none = np.zeros(0)
         for _ in motion.command.T:
-            yield _Moving(none, none, none, none, none, np.zeros((1, 2)), np.inf)
+            yield _Moving(none, none, none, none, none, np.zeros((1, 3)), np.inf)
         return
     even, step, width, kernels, (mean, rate, rate2) = averaged
     at = even[width // 2 : width // 2 + len(mean)]
@@ -304,11 +315,12 @@ def _moving(plant: MultibodyPlant, motion: ServoLog) -> Iterator[_Moving]:
     needed = needed_efforts(plant, mean[some], rate[some], rate2[some])
     for i, command in enumerate(motion.command.T):
         there = np.flatnonzero(np.isfinite(command))
-        told = np.zeros(len(at))
+        told = np.zeros((2, len(at)))
         moves = np.zeros(len(at), bool)
         if len(there) > 1:
-            held = _mean_held(t[there], command[there], even, step)
-            told = np.convolve(held, kernels[0], "valid")
+            every = (_mean_held(t[there], command[there], even, step),
+                     np.interp(even, t[there], command[there]))  # fmt: skip
+            told = np.stack([np.convolve(x, kernels[0], "valid") for x in every])
             v = np.abs(rate[:, i])
             moves = v > MOVES * np.quantile(v, 0.95)
             moves = minimum_filter1d(moves, width)
@@ -318,7 +330,7 @@ def _moving(plant: MultibodyPlant, motion: ServoLog) -> Iterator[_Moving]:
         k = some[own]
         yield _Moving(
             at[k], mean[k, i], rate[k, i], rate2[k, i], needed[own, i],
-            np.stack([at, told], axis=1), step * stride,
+            np.column_stack([at, *told]), step * stride,
         )  # fmt: skip
 
 
@@ -327,7 +339,7 @@ def averaged_motion(motion: ServoLog):
     positions, rates and accelerations by them; None where a log is too short."""
     t = motion.time
     step = float(np.median(np.diff(t))) if len(t) > 1 else np.inf
-    width = max(int(round(KERNEL_SEC / step)), LEAST_SAMPLES) | 1
+    width = max(int(round(KERNEL_SEC / step)), LEAST_SAMPLES) + 6 | 1
     even = np.arange(t[0], t[-1], step) if np.isfinite(step) else t[:0]
     if len(even) < 4 * width:
         return None
@@ -376,15 +388,16 @@ def _mean_held(t, command, at, width: float) -> np.ndarray:
 
 def _bump(width: int, step: float) -> list[np.ndarray]:
     """(width,) weights of a mean over a smooth bump, and of its two derivatives: what
-    is averaged by one and the same kernel stays an equation."""
-    s, half = np.linspace(-1.0, 1.0, width), 0.5 * step * (width - 1)
-    b = 1.0 - s**2
-    mean = b**4 / np.sum(b**4)
-    rate, rate2 = -s * b**3, (6.0 * s**2 - b) * b**2
-    # A sum over a few samples is not the integral: exact for straight lines, parabolas.
-    rate2 -= np.sum(rate2) * mean
-    t = half * s
-    return [mean, rate / -np.sum(rate * t), 2.0 * rate2 / np.sum(rate2 * t**2)]
+    is averaged by one and the same kernel stays an equation. The derivatives are
+    differences of sixth order of the mean, so that this holds at all frequencies that
+    the mean lets through."""
+    b = (1.0 - np.linspace(-1.0, 1.0, width - 6 + 2)[1:-1] ** 2) ** 4
+    mean = b / b.sum()
+    first = np.array([1.0, -9.0, 45.0, 0.0, -45.0, 9.0, -1.0]) / (60.0 * step)
+    second = np.array([2.0, -27.0, 270.0, -490.0, 270.0, -27.0, 2.0])
+    second /= 180.0 * step**2
+    rates = (np.convolve(mean, each) for each in (first, second))
+    return [np.pad(mean, 3), *rates]
 
 
 def needed_efforts(plant: MultibodyPlant, q, v, vd) -> np.ndarray:
