@@ -36,6 +36,7 @@ LAW_LEAVES = 0.01  # Of the variance of an effort that is what its servo gives.
 # late [s].
 LATE_EVIDENCE, MOST_LATE = 10.0, 0.1
 BETWEEN = 0.1  # Of a row: commands that are so much later than one do not hold for it.
+FINE = 0.02  # Of the kernel: a cost changes little with how late commands are by this.
 NOTHING = 1e-12  # Of a variance: rounding leaves so much,
 WITHIN_ROWS = 0.01  # and what happens within a row this, times (row / KERNEL_SEC)^2.
 LAW_OFF = 0.03  # Of the gains of a file, which are rather taken than those of a fit.
@@ -138,6 +139,7 @@ def _most_likely(moving: Sequence[Sequence[_Moving]]) -> _Way:
     if not joints:
         return _Way()
     row = min(float(np.diff(one.told[:2, 0])[0]) for own in joints for one in own)
+    step = max(row, FINE * KERNEL_SEC)
 
     def cost(way: _Way, least: float = NOTHING) -> float:
         total = 0.0
@@ -153,11 +155,11 @@ def _most_likely(moving: Sequence[Sequence[_Moving]]) -> _Way:
     ways = []
     for rotors, lines in product((False, True), (False, True)):
         by_late = partial(_Way, rotors, lines)
-        some = np.arange(-row if lines else 0.0, MOST_LATE, row)
+        some = np.arange(-row if lines else 0.0, MOST_LATE, step)
         late = min(some, key=lambda late: cost(by_late(late)))
         found = minimize_scalar(
             lambda late: cost(by_late(late)),  # noqa: B023
-            bounds=(max(late - row, some[0]), late + row), method="bounded",
+            bounds=(max(late - step, some[0]), late + step), method="bounded",
         )  # fmt: skip
         ways += [by_late(float(found.x))] + [by_late(0.0)] * (not lines)
 
