@@ -44,11 +44,11 @@ from makebreak.systems.contact_mpc.numerics.parameter_posterior import (
     acting,
     certain_part,
     changes_by,
-    drifted,
     error_weights,
     explain,
     gradient_and_information,
     impact_part,
+    less_certain,
     prior,
     root_of,
     step_of,
@@ -366,24 +366,24 @@ def test_only_what_is_certain_is_acted_on():
     assert mass == pytest.approx(1.38 - 1.0 / (214.0 * 1.38), abs=1e-4)
 
 
-def test_drift_forgets_but_never_below_the_model():
+def test_further_variance_forgets_but_never_below_the_model():
     sure = Belief(np.array([1.0, 2.0]), np.diag([100.0, 100.0]))
-    later = drifted(sure, np.array([0.04, 0.0]))
+    later = less_certain(sure, np.array([0.04, 0.0]))
     np.testing.assert_allclose(later.std, [np.sqrt(0.05), 0.1])
-    np.testing.assert_allclose(drifted(sure, np.array([9.0, 9.0])).std, 1.0)
+    np.testing.assert_allclose(less_certain(sure, np.array([9.0, 9.0])).std, 1.0)
 
 
 def test_errors_in_parts_of_the_change_weigh_less_and_as_the_mass_matrix_says():
     M = np.array([[2.0, 0.3], [0.3, 1.0]])
     Q = np.array([0.0, 0.0, 1e4, 1e4])
     lacks = np.array([0.0, 0.0, 0.5, -1.0])
-    W = error_weights(Q, 0.1, lacks, M)
+    W, _ = error_weights(Q, 0.1, lacks, M)
     size = 0.01 * lacks[2:] @ M @ lacks[2:] / 2.0
     expected = np.linalg.inv(np.diag(1.0 / Q[2:]) + size * np.linalg.inv(M))
     np.testing.assert_allclose(W[2:, 2:], expected, rtol=1e-9)
     assert not W[:2].any()
     np.testing.assert_allclose(root_of(W).T @ root_of(W), W, atol=1e-9 * W.max())
-    np.testing.assert_array_equal(error_weights(Q, 0.1, np.zeros(4), M), np.diag(Q))
+    np.testing.assert_array_equal(error_weights(Q, 0.1, np.zeros(4), M)[0], np.diag(Q))
 
 
 def test_scale_and_its_slopes():

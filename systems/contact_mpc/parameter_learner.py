@@ -24,10 +24,11 @@ from makebreak.systems.contact_mpc.numerics.parameter_posterior import (
     acting,
     certain_part,
     changes_by,
-    drifted,
     error_weights,
     explain,
     impact_part,
+    less_certain,
+    nearest,
     normals,
     prior,
     pushes,
@@ -46,7 +47,6 @@ NINETY = 1.645  # Deviations of a 90 % interval.
 # two holds a force between its edges that is up to 29 %, on average 10 %, less than the
 # largest, and friction would be learned as that much larger; four: 8 %, on average 3 %.
 DIRECTIONS = 4
-GAP_STARTS = (-2.0, -1.0, 1.0, 2.0)  # Deviations of a gap to look for contact at.
 
 
 class ParameterStatus(IntEnum):
@@ -174,6 +174,10 @@ class ParameterLearner(LeafSystem):
         self._gap_std = m.parameters.of_pairs(
             "gap", self._scale.std, np.zeros(len(c.contacts))
         )
+        # A closed contact's gap is off in each step by the same: no step makes it surer.
+        deep = np.array([c.contact_std * period_sec if p.kind == "gap" else 0.0
+                         for p in c.parameters])  # fmt: skip
+        self._constant = (deep / self._scale.std) ** 2
         self._drift = np.array([p.drift for p in c.parameters]) ** 2 * period_sec
         self._config, n = c, len(c.parameters)
         self._x = self.DeclareVectorInputPort("x", m.n_x)
@@ -195,13 +199,17 @@ class ParameterLearner(LeafSystem):
 
         caution = np.array([p.caution for p in c.parameters])
 
+        def known(memory):
+            return less_certain(memory.belief, self._constant)
+
         def to_plan_with(memory):
-            z = certain_part(memory.belief) - caution * memory.belief.std
+            belief = known(memory)
+            z = certain_part(belief) - caution * belief.std
             return np.maximum(values(z), lowest)
 
         output("parameters", n, to_plan_with)
         output("estimate", n, lambda m: values(m.belief.mean))
-        output("std", n, lambda m: m.belief.std)
+        output("std", n, lambda m: known(m).std)
         spread = np.where(self._scale.is_log, self._scale.std, 0.0)
         output("unknown", 1, lambda m: np.linalg.norm(spread * m.belief.std))
         output("loss", 1, lambda m: m.loss)
@@ -213,7 +221,7 @@ class ParameterLearner(LeafSystem):
     def learned(self, context) -> list[LearnedParameter]:
         """What is known of each parameter, in a context of this system."""
         belief, scale = self._memory_of(context).belief, self._scale
-        reach = NINETY * belief.std
+        reach = NINETY * less_certain(belief, self._constant).std
         rows = zip(
             self.model.parameters.names,
             scale.nominal,
@@ -286,19 +294,27 @@ class ParameterLearner(LeafSystem):
             loss, slides = self._loss_of(belief, sample, build)
         except (ValueError, RuntimeError):  # No LCS about these states.
             return belief, None
-        starts = []
-        for i, p in enumerate(c.parameters):
-            if p.kind == "gap":
-                for at in GAP_STARTS:
-                    start = belief.mean.copy()
-                    start[i] = at
-                    starts.append(start)
-        belief = drifted(belief, self._drift)
+        starts = self._touching(belief, sample, build)
+        belief = less_certain(belief, self._drift)
         after, found = updated(belief, sample, loss, c.trust, build, changes, starts)
         # What no value explains within the noise is something that the model lacks.
         if found is not None and 2.0 * found.loss > self._noise_of(found):
             return belief, found
         return after, found
+
+    def _touching(self, belief: Belief, sample: Sample, build) -> list[np.ndarray]:
+        """The mean (n,) with each gap in turn as it is if its pairs touch in the step,
+        a deviation deep: the loss is flat where a contact is missed."""
+        lcs, starts = build(belief.mean), []
+        apart = nearest(lcs, sample) + self._config.contact_std
+        pair = self.model.of_rows(lcs, np.arange(self.model.n_pairs))
+        for i, p in enumerate(self._config.parameters):
+            mine = np.isfinite(lcs.phi) & np.isin(pair, p.pairs)
+            if p.kind == "gap" and mine.any():
+                start = belief.mean.copy()
+                start[i] -= self.model.dt_sec * apart[mine].min() / p.std
+                starts.append(start)
+        return starts
 
     def _noise_of(self, found: Explained) -> float:
         """The most that twice a step's loss may be by noise: of a chi-square of as many
@@ -344,8 +360,8 @@ class ParameterLearner(LeafSystem):
                 further += astray @ astray.T
         impacts = c.impact_share**2 * impact_part(lcs, sample, lacks)
         share = np.sqrt(c.error_share**2 + impacts)
-        W = error_weights(self._Q_d, share, lacks, sample.M, further)
-        return replace(loss, W=W), acts.slides
+        W, of_model = error_weights(self._Q_d, share, lacks, sample.M, further)
+        return replace(loss, W=W, of_model=of_model), acts.slides
 
     def _elsewhere(self, sample: Sample, lcs, friction, high, lam) -> np.ndarray:
         """(n_v, n_v) covariance of a step's velocities from where contacts are: a

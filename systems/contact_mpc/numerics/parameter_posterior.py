@@ -125,12 +125,19 @@ class Acting:
 @dataclass(frozen=True)
 class Loss:
     """W (n_x, n_x) inverse covariance of the one-step errors; eps, gamma as in
-    residual_learner.py; acting; None: no contact slides."""
+    residual_learner.py; acting; None: no contact slides. of_model (n_v, n_v): what part
+    of an error of the velocities is the model's, and not the sensors'; None: nothing."""
 
     W: np.ndarray
     eps: float
     gamma: float
     acting: Acting | None = None
+    of_model: np.ndarray | None = None
+
+    def not_in_gaps(self, lcs: LCS) -> np.ndarray:
+        """(n_lam, n_v) what of an error of the velocities is no error of gap speeds."""
+        J = pushes(lcs)[0]
+        return np.zeros_like(J) if self.of_model is None else J @ self.of_model
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,19 +222,17 @@ def step_of(lcs: LCS, sample: Sample):
     """(n_x,), (n_lam,) what the model about the middle lacks of the measured change
     without contact forces, and the gap velocities at the end without them."""
     x, n_v = sample.x, sample.v_mean.size
-    v_now, v_next = sample.x_now[-n_v:], sample.x_next[-n_v:]
     lacks = lcs.A @ x + lcs.B @ sample.u + lcs.d - x
     lacks -= sample.x_next - sample.x_now
-    # A contact that pushes is closed at one end of the step at least: its row has the
-    # smaller of the gaps there, instead of one that the end's velocity extrapolates,
-    # and the error of that velocity: Anitescu's contact would open as it slides.
-    J = pushes(lcs)[0]
-    w = lcs.E @ x + lcs.H @ sample.u + lcs.c - J @ (sample.v_mean - v_now + v_next)
-    return lacks, w - 0.5 * abs(normals(lcs) @ sample.v_mean)
+    # A contact that pushes is closed somewhere in the step: its row has the smallest
+    # gap of it, instead of one that the end's velocity extrapolates, and the error of
+    # that velocity: Anitescu's contact would open as it slides.
+    return lacks, nearest(lcs, sample) + pushes(lcs)[0] @ lacks[-n_v:]
 
 
-def error_weights(Q_d, share, lacks, M, further=0.0) -> np.ndarray:
-    """(n_x, n_x) inverse covariance of a step's errors.
+def error_weights(Q_d, share, lacks, M, further=0.0) -> tuple[np.ndarray, np.ndarray]:
+    """(n_x, n_x) inverse covariance of a step's errors, and (n_v, n_v) what part of an
+    error of the velocities is the model's.
 
     Args: Q_d (n_x,) inverse variances that do not depend on the step; lacks (n_x,): the
         measured change that is not that of free motion; share: further error in parts
@@ -238,10 +243,11 @@ def error_weights(Q_d, share, lacks, M, further=0.0) -> np.ndarray:
     W = np.diag(np.asarray(Q_d, dtype=float))
     size = share**2 * (lacks[-n_v:] @ M @ lacks[-n_v:]) / n_v
     more = size * np.linalg.inv(M) + further
+    Q, of_sensors = W[-n_v:, -n_v:], np.eye(n_v)
     if more.any():  # (1 / Q + more)^-1, as Q may be zero.
-        Q = W[-n_v:, -n_v:]
-        W[-n_v:, -n_v:] = Q @ np.linalg.inv(np.eye(n_v) + more @ Q)
-    return W
+        of_sensors = np.linalg.inv(of_sensors + more @ Q)
+        W[-n_v:, -n_v:] = Q @ of_sensors
+    return W, np.eye(n_v) - of_sensors
 
 
 def root_of(W) -> np.ndarray:
@@ -300,22 +306,30 @@ def tangents(along, friction, mine, high=1.0) -> np.ndarray:
 
 
 def nearest(lcs: LCS, sample: Sample) -> np.ndarray:
-    """(n_lam,) the smaller of a contact's two measured gaps at the ends of the step,
-    over its time [m/s]; zero where w holds no gap."""
-    _, phi, _ = pushes(lcs)
-    gap = np.where(np.isfinite(phi), phi, 0.0) / lcs.dt
-    return gap - 0.5 * abs(normals(lcs) @ sample.v_mean)
+    """(n_lam,) the smallest measured gap of a contact in the step, over its time [m/s];
+    zero where w holds no gap. It is at one of the ends, or, of a contact that came
+    nearer at first and parts at last, where the two velocities meet."""
+    (_, phi, _), normal, n_v = pushes(lcs), normals(lcs), sample.v_mean.size
+    gap, mean = np.where(np.isfinite(phi), phi, 0.0) / lcs.dt, normal @ sample.v_mean
+    nearing = np.maximum(-normal @ sample.x_now[-n_v:], 0.0)
+    parting = np.maximum(normal @ sample.x_next[-n_v:], 0.0)
+    both = np.maximum(nearing + parting, 1e-300)
+    meet = np.where(parting > 0.0, np.clip((parting - mean) / both, 0.0, 1.0), 0.0)
+    return np.minimum(gap - 0.5 * mean - nearing * meet, gap - 0.5 * abs(mean))
 
 
 def explain(lcs: LCS, sample: Sample, loss: Loss) -> Explained | None:
     """The forces of the violation-based loss; None where its QP was not solved."""
     z, q = step_of(lcs, sample)
     own = loss.acting or acting(lcs, sample, np.ones(lcs.n_lam), np.inf)
+    # The error of the end's velocity is one of the gap as far as it is the sensors'.
+    n_v, not_there = sample.v_mean.size, loss.not_in_gaps(lcs)
+    q = q - not_there @ z[-n_v:]
     D, q = lcs.D @ own.ways, own.rows.T @ q
     weighted = loss.eps * D.T @ loss.W
     P, p = weighted @ D, weighted @ z
     # As soft as one edge, and so soft that the QP is convex.
-    F = own.rows.T @ lcs.F @ own.ways
+    F = own.rows.T @ (lcs.F - not_there @ lcs.D[-n_v:]) @ own.ways
     F += loss.gamma * (np.eye(len(q)) - own.rows.T @ own.ways)
     if not all(np.isfinite(of_qp).all() for of_qp in (P, p, F, q)):
         return None
@@ -362,6 +376,7 @@ def gradient_and_information(
         for nothing unless it is BEYOND_NOISE.
     """
     error = step_of(found.lcs, sample)[0] + found.lcs.D @ found.lam
+    dw = dw - loss.not_in_gaps(found.lcs) @ dx[-sample.v_mean.size :]
     dw = found.acting.rows.T @ dw
     gradient = dx.T @ loss.W @ error + dw.T @ found.force / loss.eps
     root, stiff = root_of(loss.W), 1.0 / np.sqrt(loss.eps * loss.gamma)
@@ -450,9 +465,8 @@ def updated(
     return Belief(z, belief.information + more), found
 
 
-def drifted(belief: Belief, variance) -> Belief:
-    """The belief a moment later, (n,) of which variance is new; never less certain
-    than the model."""
+def less_certain(belief: Belief, variance) -> Belief:
+    """The belief with further variance (n,); never less certain than the model."""
     if not np.any(variance):
         return belief
     covariance = np.linalg.inv(belief.information)
