@@ -49,6 +49,7 @@ from makebreak.systems.contact_mpc.numerics.parameter_posterior import (
     gradient_and_information,
     impact_part,
     less_certain,
+    nearest,
     prior,
     root_of,
     step_of,
@@ -422,6 +423,26 @@ def box_step(learner, velocity, next_velocity=None):
     ends[:, V_BALL] = velocity, velocity if next_velocity is None else next_velocity
     ends[1, P_BALL] += 0.05 * ends[:, V_BALL].mean(axis=0)
     return Sample(ends[0], np.zeros(3), ends[1], *learner.model.between(*ends))
+
+
+@pytest.mark.parametrize(
+    ("ends", "smallest"),
+    [((-0.3, 0.5), -0.3 * 0.025), ((0.3, 0.5), 0.0), ((-0.3, -0.5), -0.02),
+     ((0.2, -0.2), 0.0)],
+)  # fmt: skip
+def test_the_smallest_gap_of_a_step_may_be_within_it(ends, smallest):
+    """A box falls at 0.3 m/s and is back at 0.5 m/s: in between it was 7.5 mm lower, if
+    it fell for half of the step. At uneven speeds no gap is below both ends' unless it
+    first came nearer and parted then."""
+    learner, sample = sliding_box([0.0, 0.0, ends[0]], [0.0, 0.0, ends[1]])
+    if smallest == -0.3 * 0.025:  # It falls and rises for half of the step each.
+        x_next = sample.x_next.copy()
+        x_next[P_BALL.stop - 1] = sample.x_now[P_BALL.stop - 1] + 0.2 * 0.025
+        between = learner.model.between(sample.x_now, x_next)
+        sample = Sample(sample.x_now, sample.u, x_next, *between)
+    first = learner.model.build(sample.x_now, sample.u).phi
+    gap = 0.05 * nearest(learner.model.build(sample.x, sample.u), sample)
+    np.testing.assert_allclose(gap - first, smallest, atol=1e-6)
 
 
 @pytest.mark.parametrize("degrees", [0.0, 13.0, 22.5, 200.0])
@@ -811,6 +832,10 @@ def test_a_force_at_a_distance_tells_of_no_mass():
         pytest.param({"mass": 1.5}, marks=pytest.mark.slow),
         pytest.param({"gap": 0.015}, marks=pytest.mark.slow),
         {"gap": -0.012, "mass": 4.5},
+        # These feet slide as they land. (Mass and gap 3.85 kg and 0.9 mm, body 23 mm
+        # too low; with the first gap in which they touch at an end, 2 mm off.)
+        {"friction": 0.527, "mass": 4.824},
+        pytest.param({"friction": 0.383}, marks=pytest.mark.slow),
     ],
     ids=str,
 )
@@ -909,6 +934,18 @@ def test_what_sticks_tells_of_friction_only_beyond_the_noise():
             expected = 1.0 if counts or not one_sided else 0.0
             np.testing.assert_allclose(information, expected)
             np.testing.assert_allclose(gradient, -off * expected)
+
+
+def test_rounding_errors_of_a_friction_take_nothing_from_a_mass():
+    """(A leg of half the mass stood 19 mm too high and learned nothing.)"""
+    lcs, loss = sliding(1.0), Loss(np.diag([0.0, 1.0]), 1.0, 1e-4)
+    dx, dw = np.array([[0.0, 0.0], [1.0, 1e-17]]), np.zeros((1, 2))
+    sample = Sample(np.zeros(2), np.zeros(1), np.array([0.0, 1.0]), np.zeros(1),
+                    np.eye(1))  # fmt: skip
+    _, information = gradient_and_information(
+        explain(lcs, sample, loss), sample, loss, dx, dw, np.array([False, True])
+    )
+    np.testing.assert_allclose(information, np.diag([1.0, 0.0]), atol=1e-9)
 
 
 def test_what_sticks_tells_of_no_friction_where_the_explanation_lifts_the_object():
@@ -1014,6 +1051,25 @@ def test_what_a_plan_relies_on_is_planned_with_at_its_lower_end():
         assert got == pytest.approx([planned], rel=1e-3)
 
 
+def test_a_gap_is_known_to_no_less_than_a_step_tells():
+    """What is off in each step by the same: the estimate stays, the plan is careful."""
+    items = [Parameter("gap", 0.01, pairs=[0]), Parameter("mass", 0.5, "door")]
+    diagram, _ = diagram_of(DOOR.world(DOOR.values))
+    config = ParameterLearnerConfig(DOOR.pairs(DOOR.values), items, contact_std=0.02)
+    learner = ParameterLearner(diagram, config, 0.05)
+    context = learner.CreateDefaultContext()
+    memory = learner._memory_of(context)
+    belief = Belief(np.array([0.2, 0.0]), np.diag([1e8, 100.0]))
+    context.SetAbstractState(0, replace(memory, belief=belief))
+    std = learner.GetOutputPort("std").Eval(context)
+    np.testing.assert_allclose(std, [0.1, 0.1], rtol=1e-4)  # 1 mm, of 10.
+    gap = learner.learned(context)[0]
+    assert gap.learned == pytest.approx(2e-3)
+    assert gap.high - gap.learned == pytest.approx(1.645e-3, rel=1e-4)
+    planned = learner.GetOutputPort("parameters").Eval(context)
+    assert planned[0] == pytest.approx(2e-3 * (1.0 - 0.25), rel=1e-3)
+
+
 @pytest.mark.parametrize("chooses", [False, True])
 def test_many_states_get_the_values_of_parameters_too(chooses):
     """In closed form, as one by one by the general path."""
@@ -1051,7 +1107,7 @@ def test_many_states_get_the_values_of_parameters_too(chooses):
 def test_a_wrong_friction_is_no_gap_and_no_mass():
     learned = bench.run(DOOR, DOOR.values | {"friction": 0.8}, False, True)
     mass, damping, friction, gap = learned.values
-    assert friction == pytest.approx(0.8, rel=0.15)
+    assert friction == pytest.approx(0.8, rel=0.2) and (abs(learned.off) < 1.645).all()
     assert mass == pytest.approx(2.0, rel=0.15) and abs(gap) < 1e-3
 
 

@@ -174,7 +174,7 @@ class ParameterLearner(LeafSystem):
         self._gap_std = m.parameters.of_pairs(
             "gap", self._scale.std, np.zeros(len(c.contacts))
         )
-        # A closed contact's gap is off in each step by the same: no step makes it surer.
+        # A closed contact's gap may be off by the same in each step.
         deep = np.array([c.contact_std * period_sec if p.kind == "gap" else 0.0
                          for p in c.parameters])  # fmt: skip
         self._constant = (deep / self._scale.std) ** 2

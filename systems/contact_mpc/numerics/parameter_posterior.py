@@ -37,6 +37,7 @@ NEWTON_STEPS = 4  # Of one update, at most.
 HALVINGS = 4  # Of a Gauss-Newton step that does not lower the cost.
 BEYOND_NOISE = 2.0  # Deviations.
 SMALL = 1e-2  # A change of z that ends the update.
+ROUNDING = 1e-6  # Of what a deviation of z changes, in deviations of a step's errors.
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,8 +126,8 @@ class Acting:
 @dataclass(frozen=True)
 class Loss:
     """W (n_x, n_x) inverse covariance of the one-step errors; eps, gamma as in
-    residual_learner.py; acting; None: no contact slides. of_model (n_v, n_v): what part
-    of an error of the velocities is the model's, and not the sensors'; None: nothing."""
+    residual_learner.py; acting; None: no contact slides. of_model (n_v, n_v): part of
+    the velocities' errors that is the model's, and not the sensors'; None: nothing."""
 
     W: np.ndarray
     eps: float
@@ -395,7 +396,9 @@ def gradient_and_information(
     )
     # Then its friction may be any, and what another parameter changes as a friction
     # does tells as little: a mass would get what the friction is not allowed to.
-    told = _unexplained(of_z, of_z[:, noise])
+    # (Rounding errors of a friction that changes nothing have any direction.)
+    changes = abs(of_z).max(axis=0, initial=0.0) > ROUNDING
+    told = _unexplained(of_z, of_z[:, noise & changes])
     gradient, of_z = gradient + (told - of_z).T @ missed, told
     # A force at a distance stands for what the model lacks, and tells of gaps alone.
     far = nearest(found.lcs, sample) > BEYOND_NOISE * np.sqrt(loss.eps * loss.gamma)
