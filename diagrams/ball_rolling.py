@@ -214,7 +214,7 @@ class _Rig:
     model: TipAndBall  # What the controllers believe.
     station: Diagram
     arm: MultibodyPlant  # Of the controllers.
-    lcs: dict[str, LeafSystem]  # "plan", "command" and "learn".
+    lcs: dict[str, LeafSystem]  # "plan", "command" and, for a residual, "learn".
     lcs_of: dict[str, AnitescuLcs]  # What these build with.
     estimator: StateEstimator
 
@@ -385,7 +385,8 @@ def _refuse_unused(config: BallRollingConfig) -> None:
 def _add_models(
     builder: DiagramBuilder, config: BallRollingConfig, model: TipAndBall
 ) -> tuple[dict[str, LeafSystem], dict[str, AnitescuLcs]]:
-    """The three LCS: as systems, and what they build with."""
+    """The LCS: as systems, and what they build with. A learner of parameters has its
+    own."""
     friction, tangent = config.planner.friction, ContactPair().tangent
     if config.contact_sequence == "sampled":
         # Edges along the vertical do not jump as the normal goes around the ball.
@@ -398,7 +399,7 @@ def _add_models(
         ("plan", PLAN_DT, CONTROL),
         ("command", CONTROL, CONTROL),
         ("learn", LEARN, LEARN),
-    ):
+    )[: 2 if items else 3]:
         own = AnitescuLcsBuilder(
             make_tip_and_ball(model)[0],
             LcsBuilderConfig(

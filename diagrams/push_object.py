@@ -165,7 +165,7 @@ def make_push_object(
     model = _make_model(config)
     station = _add_station(builder, config, meshcat)
     items = learned_parameters(config)
-    lcs = _add_lcs_builders(builder, model, [p for p in items if p.kind != "gap"])
+    lcs = _add_lcs_builders(builder, model, items)
     sensor, estimator = _add_sensing(builder, config, model, station)
     planning = _add_planning(builder, config, model, lcs)
     reference, impedance = _add_arm_control(builder, config, model, planning, lcs)
@@ -320,20 +320,21 @@ def _add_station(builder: DiagramBuilder, config: PushObjectConfig, meshcat) -> 
 def _add_lcs_builders(
     builder: DiagramBuilder, model: _Model, items: list[Parameter]
 ) -> dict[str, AnitescuLcsBuilder]:
-    """The contact model for planning, for the command between knots, for learning."""
-    added = {}
+    """The contact model for planning, for the command between knots, and for learning
+    gaps; a learner of the items has its own."""
+    added, planned = {}, [p for p in items if p.kind != "gap"]
     for name, dt, period, weight in (
         ("plan", PLAN_DT, CONTROL, model.weight),
         ("command", CONTROL, CONTROL, model.weight),
         ("learn", LEARN, LEARN, 1.0),
-    ):
+    )[: 2 if items else 3]:
         pairs = contact_pairs(model.spec, model.friction, weight)
         added[name] = builder.AddNamedSystem(
             f"lcs_{name}",
             AnitescuLcsBuilder(
                 make_tip_and_object(model.spec, model.tip, weight=weight)[0],
                 LcsBuilderConfig(
-                    pairs, dt, None, period, OFFSET["lcs"], parameters=items
+                    pairs, dt, None, period, OFFSET["lcs"], parameters=planned
                 ),
             ),
         )

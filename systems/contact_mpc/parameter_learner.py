@@ -27,12 +27,12 @@ from makebreak.systems.contact_mpc.numerics.parameter_posterior import (
     error_weights,
     explain,
     impact_part,
+    lacks_of,
     less_certain,
     nearest,
     normals,
     prior,
     pushes,
-    step_of,
     tangent_edges,
     tangents,
     updated,
@@ -334,7 +334,7 @@ class ParameterLearner(LeafSystem):
         friction, high = (model.of_rows(lcs, of) for of in (friction, self._high))
         acts = acting(lcs, sample, friction, c.slip_noise, high)
         loss = replace(self._loss, acting=acts)
-        lacks = step_of(lcs, sample)[0]
+        lacks = lacks_of(lcs, sample)
         further = model.parameters.unknown_at_rest(
             values, self._scale.slopes(values) * belief.std,
             sample.x_now[-model.n_v :], sample.x_next[-model.n_v :],

@@ -23,6 +23,7 @@ Control 38 (1993).
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -181,8 +182,7 @@ def acting(
     for one in np.unique(contact):
         mine = contact == one
         k, ratio = int(mine.sum()), 1.0 if high is None else high[mine][0]
-        edges = friction_edges(max(k // 2, 1))[:k]
-        axes, tilted = np.linalg.pinv(edges), 1.0
+        (_, axes), tilted = _edges(k), 1.0
         now, after = v_ends @ tangents(along, friction, mine, ratio).T
         slip, change = 0.5 * (now + after), after - now
         error, spread = noise**2, np.zeros(1)
@@ -219,12 +219,16 @@ def acting(
     return Acting(ways, rows, slides, np.array(errors))
 
 
+def lacks_of(lcs: LCS, sample: Sample) -> np.ndarray:
+    """(n_x,) what the model about the middle lacks of the measured change without
+    contact forces."""
+    x = sample.x
+    return lcs.A @ x + lcs.B @ sample.u + lcs.d - x - (sample.x_next - sample.x_now)
+
+
 def step_of(lcs: LCS, sample: Sample):
-    """(n_x,), (n_lam,) what the model about the middle lacks of the measured change
-    without contact forces, and the gap velocities at the end without them."""
-    x, n_v = sample.x, sample.v_mean.size
-    lacks = lcs.A @ x + lcs.B @ sample.u + lcs.d - x
-    lacks -= sample.x_next - sample.x_now
+    """lacks_of, and (n_lam,) the gap velocities at the end without contact forces."""
+    lacks, n_v = lacks_of(lcs, sample), sample.v_mean.size
     # A contact that pushes is closed somewhere in the step: its row has the smallest
     # gap of it, instead of one that the end's velocity extrapolates, and the error of
     # that velocity: Anitescu's contact would open as it slides.
@@ -288,14 +292,20 @@ def normals(lcs: LCS) -> np.ndarray:
     return same @ J / np.maximum(same.sum(axis=1), 1)[:, None]
 
 
+@lru_cache
+def _edges(k: int) -> tuple[np.ndarray, np.ndarray]:
+    """(k, 2) friction edges of a contact, and their pseudo-inverse (2, k)."""
+    edges = friction_edges(max(k // 2, 1))[:k]
+    return edges, np.linalg.pinv(edges)
+
+
 def tangent_edges(friction, mine, high=1.0) -> np.ndarray:
     """(k, 2) force along the two tangents of a contact, of each of its k rows.
 
     Args: friction (n_lam,) of the rows' contacts; mine (n_lam,) bool: the contact's,
         of which high is the anisotropy.
     """
-    k = int(mine.sum())
-    return friction[mine][:, None] * friction_edges(max(k // 2, 1))[:k] * [high, 1.0]
+    return friction[mine][:, None] * _edges(int(mine.sum()))[0] * [high, 1.0]
 
 
 def tangents(along, friction, mine, high=1.0) -> np.ndarray:
@@ -303,7 +313,8 @@ def tangents(along, friction, mine, high=1.0) -> np.ndarray:
 
     Args: along (n_lam, n_v): what rows push along, less their normals.
     """
-    return np.linalg.pinv(tangent_edges(friction, mine, high)) @ along[mine]
+    axes, mu = _edges(int(mine.sum()))[1], friction[mine][0]
+    return (axes / [[high], [1.0]] / mu if mu > 0.0 else 0.0 * axes) @ along[mine]
 
 
 def nearest(lcs: LCS, sample: Sample) -> np.ndarray:
@@ -376,7 +387,7 @@ def gradient_and_information(
         goes one way would count, and what goes the other way not, so such a step counts
         for nothing unless it is BEYOND_NOISE.
     """
-    error = step_of(found.lcs, sample)[0] + found.lcs.D @ found.lam
+    error = lacks_of(found.lcs, sample) + found.lcs.D @ found.lam
     dw = dw - loss.not_in_gaps(found.lcs) @ dx[-sample.v_mean.size :]
     dw = found.acting.rows.T @ dw
     gradient = dx.T @ loss.W @ error + dw.T @ found.force / loss.eps
