@@ -17,7 +17,10 @@ from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Diagram
 
-from makebreak.systems.contact_mpc.multibody.constant_mass import constant_mass_model
+from makebreak.systems.contact_mpc.multibody.constant_mass import (
+    constant_mass_model,
+    with_masses,
+)
 from makebreak.systems.contact_mpc.multibody.contact_layout import ContactLayout
 from makebreak.systems.contact_mpc.multibody.model_parameters import (
     NOT_IN_PLANTS,
@@ -111,11 +114,16 @@ class AnitescuLcs:
         self.is_analytic = self._model is not None
         self.at_default()  # Compile now, and fail now if anything is wrong.
 
-    def _closed_form(self) -> ConstantMassModel | None:
-        self._plant.SetPositionsAndVelocities(self._plant_context, self.x_default)
+    def _closed_form(self, last=None) -> ConstantMassModel | None:
+        """Args: last: the model with other values of the parameters; None: there is
+        none."""
+        plant, context = self._plant, self._plant_context
+        plant.SetPositionsAndVelocities(context, self.x_default)
+        if last is not None and not self.parameters.has("damping"):
+            return with_masses(last, plant, context, self._dynamics)
         return constant_mass_model(
-            self._plant, self._plant_context, self._inspector, self._dynamics,
-            self._contacts, self._points.frames,
+            plant, context, self._inspector, self._dynamics, self._contacts,
+            self._points.frames,
         )  # fmt: skip
 
     def at_default(self) -> LCS:
@@ -178,7 +186,7 @@ class AnitescuLcs:
         if not np.array_equal(values[p.is_dynamic], self._values[p.is_dynamic]):
             self._dynamics.set_parameters(p, values)
             if self.is_analytic:
-                self._model = self._closed_form()
+                self._model = self._closed_form(self._model)
         self._values = values
         if friction is None:
             friction = self._contacts.mu_of_pairs

@@ -1,5 +1,7 @@
 """Whether a plant has the closed form of ConstantMassModel, and the data of it."""
 
+from dataclasses import replace
+
 import numpy as np
 from pydrake.geometry import Box, Cylinder, HalfSpace, Shape, Sphere
 from pydrake.multibody.plant import MultibodyPlant
@@ -72,6 +74,28 @@ def constant_mass_model(
         quaternion=array(q_of, np.int64), omega=array(v_of, np.int64),
         R=array(R), p_0=array(p_0), P=array(P), J_p=array(J_p),
         pairs=array(pairs, np.int64), reference=layout.reference,
+    )  # fmt: skip
+
+
+def with_masses(
+    model: ConstantMassModel, plant: MultibodyPlant, context: Context,
+    dynamics: SmoothDynamics,
+) -> ConstantMassModel | None:  # fmt: skip
+    """The model after masses and centres of mass have changed, and nothing else: no
+    derivative by AutoDiff, as joints' damping is the same. Arguments as above."""
+    bodies = _floating_bodies(plant, context)
+    if bodies is None:
+        return None
+    _, turning, inertias = bodies
+    x = plant.GetPositionsAndVelocities(context).copy()
+    f, M, _ = dynamics.acceleration(x, np.zeros(plant.num_actuated_dofs()))
+    M_inv = np.linalg.inv(M)
+    changed = np.linalg.solve(M, np.linalg.inv(model.M_inv))
+    J_v, J_u = changed @ model.J_v, changed @ model.J_u
+    return replace(
+        model, M_inv=M_inv, f_0=f - J_v @ x[dynamics.n_q :], J_v=J_v, J_u=J_u,
+        turning=np.array(turning, np.int64).reshape(-1, 2),
+        body=np.array(inertias, dtype=float).reshape(-1, 5, 3),
     )  # fmt: skip
 
 

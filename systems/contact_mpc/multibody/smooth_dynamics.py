@@ -33,12 +33,27 @@ class SmoothDynamics:
         self._plant_ad = plant.ToAutoDiffXd()
         self._context_ad = self._plant_ad.CreateDefaultContext()
         self._forces_ad = MultibodyForces_[AutoDiffXd](self._plant_ad)
+        self._not_in_ad: tuple | None = None  # Parameters that its context lacks.
         self.plain, self.floating, self._maps_known = _velocity_layout(plant)
 
     def set_parameters(self, parameters: ModelParameters, values) -> None:
         """Sets the values (n,) of the dynamic parameters for all that follows."""
         parameters.put(self._plant, self._context, values)
-        parameters.put(self._plant_ad, self._context_ad, values, AutoDiffXd)
+        self._not_in_ad = parameters, values
+
+    def acceleration(self, x, u, further=None) -> tuple[np.ndarray, ...]:
+        """f (n_v,), M (n_v, n_v) and the damping (n_v,) of `further`, as linearise."""
+        plant, context = self._plant, self._context
+        plant.SetPositionsAndVelocities(context, x)
+        M = plant.CalcMassMatrix(context)
+        plant.CalcForceElementsContribution(context, self._forces)
+        r = plant.CalcInverseDynamics(context, np.zeros(self.n_v), self._forces)
+        force, damping = np.zeros((2, self.n_v)) if further is None else further(M)
+        r += damping * x[self.n_q :] - force
+        try:
+            return np.linalg.solve(M, self._B_tau @ u - r), M, damping
+        except np.linalg.LinAlgError as error:
+            raise ValueError("the mass matrix is singular (a massless body)") from error
 
     def linearise(
         self, x: np.ndarray, u: np.ndarray, further=None
@@ -53,19 +68,12 @@ class SmoothDynamics:
 
         Raises: ValueError if the mass matrix is singular.
         """
-        plant, context = self._plant, self._context
-        plant.SetPositionsAndVelocities(context, x)
-        M = plant.CalcMassMatrix(context)
-        plant.CalcForceElementsContribution(context, self._forces)
-        r = plant.CalcInverseDynamics(context, np.zeros(self.n_v), self._forces)
-        force, damping = np.zeros((2, self.n_v)) if further is None else further(M)
-        r += damping * x[self.n_q :] - force
-        try:
-            f = np.linalg.solve(M, self._B_tau @ u - r)
-        except np.linalg.LinAlgError as error:
-            raise ValueError("the mass matrix is singular (a massless body)") from error
-
+        f, M, damping = self.acceleration(x, u, further)
         plant_ad, context_ad = self._plant_ad, self._context_ad
+        if self._not_in_ad is not None:
+            parameters, values = self._not_in_ad
+            parameters.put(plant_ad, context_ad, values, AutoDiffXd)
+            self._not_in_ad = None
         plant_ad.SetPositionsAndVelocities(context_ad, InitializeAutoDiff(x)[:, 0])
         plant_ad.CalcForceElementsContribution(context_ad, self._forces_ad)
         f_ad = np.array([AutoDiffXd(value) for value in f])
