@@ -297,9 +297,10 @@ class ParameterLearner(LeafSystem):
         starts = self._touching(belief, sample, build)
         belief = less_certain(belief, self._drift)
         after, found = updated(belief, sample, loss, c.trust, build, changes, starts)
-        # What no value explains within the noise is something that the model lacks.
+        # What no value explains within the noise is something that the model lacks, or
+        # a gap is believed that is none: of ground that gave way where a foot landed.
         if found is not None and 2.0 * found.loss > self._noise_of(found):
-            return belief, found
+            return less_certain(belief, self._constant), found
         return after, found
 
     def _touching(self, belief: Belief, sample: Sample, build) -> list[np.ndarray]:
