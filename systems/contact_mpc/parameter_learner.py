@@ -300,8 +300,16 @@ class ParameterLearner(LeafSystem):
         # What no value explains within the noise is something that the model lacks, or
         # a gap is believed that is none: of ground that gave way where a foot landed.
         if found is not None and 2.0 * found.loss > self._noise_of(found):
-            return less_certain(belief, self._constant), found
+            doubted = self._constant * self._pushing(found, sample)
+            return less_certain(belief, doubted), found
         return after, found
+
+    def _pushing(self, found: Explained, sample: Sample) -> np.ndarray:
+        """(n,) bool: of which parameters a pair pushes where it touches as measured."""
+        far = nearest(found.lcs, sample) > BEYOND_NOISE * self._config.contact_std
+        pair = self.model.of_rows(found.lcs, np.arange(self.model.n_pairs))
+        pushing = set(pair[(found.lam > 0.0) & ~far])
+        return np.array([bool(pushing & set(p.pairs)) for p in self._config.parameters])
 
     def _touching(self, belief: Belief, sample: Sample, build) -> list[np.ndarray]:
         """The mean (n,) with each gap in turn as it is if its pairs touch in the step,
