@@ -300,8 +300,9 @@ class ParameterLearner(LeafSystem):
         # What no value explains within the noise is something that the model lacks, or
         # a gap is believed that is none: of ground that gave way where a foot landed.
         if found is not None and 2.0 * found.loss > self._noise_of(found):
-            doubted = self._constant * self._pushing(found, sample)
-            return less_certain(belief, doubted), found
+            room = BEYOND_NOISE**2 * self._constant - belief.std**2
+            doubted = np.clip(room, 0.0, self._constant)
+            return less_certain(belief, doubted * self._pushing(found, sample)), found
         return after, found
 
     def _pushing(self, found: Explained, sample: Sample) -> np.ndarray:
