@@ -106,7 +106,10 @@ def test_efforts_that_no_command_jumps_in_stay_as_they_are(tmp_path):
     np.testing.assert_array_equal(same[name], recordings[0][name])
 
 
-@pytest.mark.parametrize("step, share", [(0.002, 0.25), (0.0005, 0.5)])
+@pytest.mark.parametrize(
+    "step, share",
+    [(0.002, 0.25), pytest.param(0.0005, 0.5, marks=pytest.mark.slow)],
+)
 def test_of_efforts_alone_no_damping_is_named(tmp_path, step, share):
     """Dampings of all joints of a Pegasus and of a B1, before."""
     file, _ = log_of_efforts(tmp_path, step)

@@ -62,6 +62,7 @@ def _checked(arguments) -> subprocess.CompletedProcess:
     )
 
 
+@pytest.mark.slow
 def test_pictures_are_never_read_or_written_beside_their_edges():
     run = _checked(["-c", PICTURES])
     assert run.stdout.strip() == "within bounds", run.stderr[-2000:]

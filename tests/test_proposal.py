@@ -572,8 +572,22 @@ def test_a_servo_is_proposed_with_the_gains_that_its_motion_tells(
     assert scene.actuation.limit == [taken]
 
 
-@pytest.mark.parametrize("rotor", [0.0, 1.5])
-@pytest.mark.parametrize("late, rows", [(0.0, 1), (-0.005, 10), (0.016, 1)])
+@pytest.mark.parametrize(
+    "late, rows, rotor",
+    [
+        (0.016, 1, 0.0),
+        (-0.005, 10, 1.5),
+        *(
+            pytest.param(*each, marks=pytest.mark.slow)
+            for each in [
+                (0.0, 1, 0.0),
+                (0.0, 1, 1.5),
+                (-0.005, 10, 0.0),
+                (0.016, 1, 1.5),
+            ]
+        ),
+    ],
+)
 def test_gains_of_motion_are_not_those_of_late_commands_or_rotors(
     tmp_path, late, rows, rotor
 ):
