@@ -16,8 +16,10 @@ T = TypeVar("T")
 # Parts of a run, each with the share of the budget at which it ends, and how long it
 # may go on after somebody asked for the end [s].
 SEARCH, PRUNE, CONCLUDE, REPORT = "search", "prune", "conclude", "report"
+LIMBS = "limbs"  # While each has a budget of its own.
 _ENDS = {
-    SEARCH: (0.6, 0.0), PRUNE: (0.8, 0.0), CONCLUDE: (0.95, 20.0), REPORT: (1.0, 20.0)
+    SEARCH: (0.6, 0.0), PRUNE: (0.8, 0.0), CONCLUDE: (0.95, 20.0), REPORT: (1.0, 20.0),
+    LIMBS: (0.96, 0.0),
 }  # fmt: skip
 LESS_SURE = {"gap_named": "ambiguous", "no_gap": "not_judged"}
 

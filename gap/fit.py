@@ -380,6 +380,7 @@ class _Free:
                 for i, name in self.names
             ]
         )
+        self._leave_for_all(problem)
         self.high = np.array([highest(start[i].kind, name) for i, name in self.names])
         self._most = np.array(
             [KINDS[start[i].kind].parameter(name).most for i, name in self.names]
@@ -387,6 +388,21 @@ class _Free:
         x0 = np.array([start[i].parameters[name] for i, name in self.names])
         x0 = np.maximum(x0, self.low + 1e-9 * self.scale)
         self.x0 = np.minimum(x0, self.high - 1e-9 * self.scale)
+
+    def _leave_for_all(self, problem: GapProblem) -> None:
+        """Raises what effects may take away where several of a kind act at one place:
+        together they take no more than the model has there."""
+        for k, (i, name) in enumerate(self.names):
+            kind, places = self.start[i].kind, self.start[i].at
+            for at in places if np.isfinite(self.low[k]) else ():
+                others = [
+                    self.low[m] for m, (j, other) in enumerate(self.names[:k])
+                    if (self.start[j].kind, other) == (kind, name)
+                    and at in self.start[j].at
+                ]  # fmt: skip
+                if others:
+                    least = problem.least(kind, [at]).get(name, -np.inf)
+                    self.low[k] = max(self.low[k], least - sum(others))
 
     def effects(self, z: np.ndarray) -> list[Effect]:
         """Effects of parameters z (n,), in units of `scale`."""

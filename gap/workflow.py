@@ -12,6 +12,7 @@ import numpy as np
 from makebreak.gap.budget import (
     CONCLUDE,
     LESS_SURE,
+    LIMBS,
     Budget,
     Stopped,
     go_on,
@@ -256,7 +257,17 @@ def _run(
                 result = nothing_compared(of_checks)
         return replace(result, unfinished=tuple(own.undone))
 
-    results = list(side_by_side([partial(of_limb, k) for k in range(len(limbs))], jobs))
+    results: list[GapResult] = []
+    with budget.part(LIMBS):
+        try:
+            for one in side_by_side(
+                [partial(of_limb, k) for k in range(len(limbs))], jobs
+            ):
+                results.append(one)
+        except Stopped:
+            for limb in limbs[len(results) :]:
+                budget.leave(f"comparing {limb[0]} and on")
+                results.append(nothing_compared(checks))
     result = joined(limbs, results)
     for what in result.unfinished:
         budget.leave(what)

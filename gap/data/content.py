@@ -1173,16 +1173,18 @@ def _round(x: float, within: float) -> float:
     return x
 
 
-def left_by(plant, joints, columns, matches: Sequence[Match]) -> float:
-    """Mean logarithm of the shares of what joints need that their efforts leave, as of
-    by_content; 0 where nothing tells."""
+def left_by(plant, joints, columns, matches: Sequence[Match]) -> dict[str, float]:
+    """{joint: logarithm of the share of what it needs that its effort leaves}, as of
+    by_content; none where nothing tells."""
     try:
         contents = Contents(plant, joints, columns, matches).fewer(FEW)
     except ValueError:
-        return 0.0
+        return {}
     efforts = _columns_of(contents, matches, _DRIVES)
     efforts = {i: name for i, name in efforts.items() if contents.moves(i)}
-    return _misfit(contents, efforts) if efforts else 0.0
+    told = _all_told(contents, efforts)
+    return {joints[i].name: float(np.log(max(x.left, LEAST_LEFT)))
+            for i, x in told.items()}  # fmt: skip
 
 
 def told_by(contents: Contents, matches: Sequence[Match]) -> dict[str, Likeness]:

@@ -4,6 +4,7 @@ import json
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -552,21 +553,31 @@ def _servos_of_efforts(
 
 def _numbered(robot: Robot, logs: Sequence[Log], said: list[Said]) -> Robot:
     """With joints counted as columns without names do, if the efforts say so: along the
-    robot (as MuJoCo, Drake and pinocchio count), as its file has them (as PyBullet), or
-    by names (as ROS)."""
+    robot (as MuJoCo and Drake count), limb by limb in the order of their names (as
+    pinocchio), as its file has them (as PyBullet), or by names (as ROS)."""
     at = {
         f"{robot.model}.{j.name()}": int(j.index()) for j in one_dof_joints(robot.plant)
     }
+    branches = _limb_by_limb(robot.plant)
     orders = {
         "as the robot's file has its joints": sorted(
             robot.joints, key=lambda joint: at[joint.name]
         ),
+        "limb by limb, limbs by their names": sorted(
+            robot.joints, key=lambda joint: branches.index(at[joint.name])
+        ),
         "by its joints' names": sorted(robot.joints, key=lambda joint: joint.name),
     }
 
-    def left(other: Robot) -> float:
-        each = [(log.table.columns, matches_of(log, other)) for log in logs]
-        return float(np.mean([left_by(robot.plant, robot.joints, *x) for x in each]))
+    def left(other: Robot) -> dict[str, float]:
+        each = [
+            left_by(
+                robot.plant, robot.joints, log.table.columns, matches_of(log, other)
+            )
+            for log in logs
+        ]
+        return {name: float(np.mean([x.get(name, 0.0) for x in each]))
+                for name in set().union(*each)}  # fmt: skip
 
     first = [m.channel for m in matches_of(logs[0], robot)]
     others = {
@@ -576,13 +587,44 @@ def _numbered(robot: Robot, logs: Sequence[Log], said: list[Said]) -> Robot:
               if [m.channel for m in matches_of(logs[0], other)] != first}  # fmt: skip
     if not others or not robot.joints:
         return robot
-    each = {word: left(other) for word, other in others.items()}
-    word = min(each, key=lambda word: each[word])
-    if not each[word] < min(np.log(1.0 - EXPLAINS), left(robot) - np.log(CLEARER)):
+    # Of mirrored limbs few joints tell whose columns they are: some are told clearly
+    # better, and none clearly worse.
+    own, best, most = left(robot), "", 0.0
+    for word, other in others.items():
+        then = left(other)
+        gains = {name: own.get(name, 0.0) - x for name, x in then.items()}
+        is_told = any(
+            gain > np.log(CLEARER) and then[name] < np.log(1.0 - EXPLAINS)
+            for name, gain in gains.items()
+        )
+        if is_told and min(gains.values()) > -np.log(CLEARER):
+            best, most = max(
+                (best, most), (word, sum(gains.values())), key=itemgetter(1)
+            )
+    if not best:
         return robot
-    says = f"By what is in them, columns without names are counted {word}."
+    says = f"By what is in them, columns without names are counted {best}."
     said.append(Said("columns_mixed", robot.joints[0].name, len(robot.joints), says))
-    return others[word]
+    return others[best]
+
+
+def _limb_by_limb(plant: MultibodyPlant) -> list[int]:
+    """Joints, each followed by all that it carries; of those at one body, by name."""
+    joints = [plant.get_joint(k) for k in plant.GetJointIndices()]
+    carried = {int(joint.child_body().index()) for joint in joints}
+    bodies = [int(joint.parent_body().index()) for joint in joints]
+    found: list[int] = []
+
+    def follow(body: int) -> None:
+        own = [j for j, at in zip(joints, bodies, strict=True) if at == body]
+        for joint in sorted(own, key=lambda joint: joint.name()):
+            found.append(int(joint.index()))
+            follow(int(joint.child_body().index()))
+
+    for root in dict.fromkeys(bodies):
+        if root not in carried:
+            follow(root)
+    return found
 
 
 def _named(log: Log, robot: Robot, said: list[Said]) -> list[Match]:
@@ -592,7 +634,8 @@ def _named(log: Log, robot: Robot, said: list[Said]) -> list[Match]:
     for first, own in layouts(columns, matches, robot.joints):
         by_column = {m.column: m for m in own}
         own = [*in_units(columns, robot.joints, by_column, log.ranges).values()]
-        left = left_by(robot.plant, robot.joints, columns, own)
+        each = left_by(robot.plant, robot.joints, columns, own).values()
+        left = float(np.mean([*each])) if each else 0.0
         tried.append((left if left < np.log(NOTHING) else 0.0, first, own))
     left, first, best = min(tried, key=lambda each: each[0], default=(0.0, {}, []))
     if left == 0.0 and "velocity" not in first:
