@@ -8,6 +8,7 @@ import pytest
 from test_gap_sticking import recorded
 
 from makebreak.gap.data.reading import read_recordings
+from makebreak.gap.fit import _Free
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Candidate, Nuisances, SearchPlan
 from makebreak.gap.residuals.contact import _of_surfaces
@@ -258,3 +259,20 @@ def test_a_member_with_an_impossible_value_goes_however_much_it_explains(least):
     screen = Screen(left, np.zeros((1800, 0)), np.zeros(0), train)
     gone = _needless_member(search_of(left, train, channel), screen, members)
     assert gone == (0 if least else None)
+
+
+def test_several_of_a_kind_at_one_joint_take_no_more_than_the_model_has():
+    """Joint a has 1 N m of friction, b has 2: what both lose alike and what b loses
+    beside that add up to no more than 2 there."""
+    has = {"a": 1.0, "b": 2.0}
+    problem = SimpleNamespace(
+        least=lambda kind, at: {"coulomb": -min(has[name] for name in at)}
+    )
+    start = [
+        Effect("joint_coulomb_friction", ["a", "b"], {"coulomb": -0.5}),
+        Effect("joint_coulomb_friction", ["b"], {"coulomb": -0.5}),
+        Effect("joint_viscous_damping", ["b"], {"damping": 0.5}),
+    ]
+    low = _Free(problem, start, [(), (), ()]).low
+    assert low[:2] == pytest.approx([-1.0, -1.0])
+    assert low[2] == -np.inf

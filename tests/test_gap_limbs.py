@@ -7,6 +7,7 @@ import pytest
 from effect_scenes import with_effects
 
 from makebreak.gap import workflow
+from makebreak.gap.budget import Stopped
 from makebreak.gap.by_part import joined, limbs_of, only, pooled
 from makebreak.gap.data.findings import Finding
 from makebreak.gap.data.reading import read_recordings
@@ -186,6 +187,22 @@ def delay(at, value, std=0.001):
         "input_delay", at, {"delay": Estimate(value, std, "s")}, "Late.",
         Evidence(2.0, 1.0, "", 0.0),
     )  # fmt: skip
+
+
+def test_limbs_that_are_done_count_where_time_is_up(tmp_path, monkeypatch):
+    recorded(tmp_path, [("joint_coulomb_friction", ["r.a0"], {"coulomb": 0.2})])
+
+    def until_the_second(calls, jobs):
+        yield calls[0]()
+        raise Stopped
+
+    monkeypatch.setattr(workflow, "side_by_side", until_the_second)
+    result = run_gap(tmp_path / "scene.yaml", [tmp_path / "recording.csv"])
+    assert [(e.kind, e.at) for e in result.effects] == [
+        ("joint_coulomb_friction", ("r.a0",))
+    ]
+    assert "nan" not in result.says and "agree" not in result.says
+    assert any("r.b0" in what for what in result.unfinished)
 
 
 @pytest.mark.parametrize(

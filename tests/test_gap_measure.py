@@ -9,9 +9,10 @@ from effect_scenes import pendulum
 from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.data.table import write_recording
 from makebreak.gap.residuals.inverse import InverseModel
-from makebreak.gap.residuals.mechanism_measure import measure
+from makebreak.gap.residuals.mechanism_measure import measure, widen
 from makebreak.gap.simulation.commands import Commands
 from makebreak.gap.simulation.scene_simulation import SceneSimulation
+from makebreak.gap.simulation.windows import WindowModel
 from makebreak.models.effects.kind import Effect
 from makebreak.models.effects.transmission import twist_deviations, twists
 from makebreak.models.scene import InitialSection
@@ -77,3 +78,20 @@ def test_a_twist_is_as_uncertain_as_the_smoothed_torque_over_the_stiffness(elast
     assert np.all(found < 2.0 * np.array(rms)) and np.all(found > 0.5 * np.array(rms))
     gap = Effect("joint_backlash", ["p.j1"], {"gap": 0.02})
     assert twist_deviations(gap, motion.dynamics, each) == {}
+
+
+def test_windows_are_no_surer_than_without_the_damping_that_a_file_has_in_vain(elastic):
+    scene, motion, _ = elastic
+    damped = replace(scene, effects=[
+        *scene.effects, Effect("joint_viscous_damping", ["p.j1"], {"damping": 9.0})
+    ])  # fmt: skip
+
+    def std(*effects) -> np.ndarray:
+        model = WindowModel(damped, motion.recordings, 0.3, most=20)
+        widen(model, effects, None)
+        return np.concatenate([w.std for w in model.windows])
+
+    less = Effect("joint_viscous_damping", ["p.j1"], {"damping": -9.0})
+    more = Effect("joint_viscous_damping", ["p.j1"], {"damping": 9.0})
+    assert np.all(std(less) >= std()) and std(less).max() > 1.2 * std().max()
+    np.testing.assert_array_equal(std(more), std())

@@ -6,6 +6,7 @@ import yaml
 from front_doors import exact
 
 from makebreak.gap.data.robot import propose_scene, read_log, read_robot
+from makebreak.gap.data.servo_gains import needed_efforts
 
 WHAT = {"position": "position", "velocity": "velocity", "effort": "effort_measured"}
 
@@ -133,3 +134,46 @@ def test_numbers_that_are_no_motion_are_refused(tmp_path):
 
     with pytest.raises(ValueError, match="no column looks like the position"):
         proposed(tmp_path, (noise, noise, noise))
+
+
+LEG = """<link name="{0}_thigh"><inertial><origin xyz="0 {1} -0.03"/><mass value="0.7"/>
+<inertia ixx="0.002" iyy="0.002" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="{0}_hip" type="revolute"><parent link="base"/><child link="{0}_thigh"/>
+<origin xyz="0 {1} 0"/><axis xyz="1 0 0"/>
+<limit lower="-2" upper="2" effort="50" velocity="20"/></joint>
+<link name="{0}_shank"><inertial><origin xyz="0.01 0 -0.1"/><mass value="0.3"/>
+<inertia ixx="0.001" iyy="0.001" izz="0.0004" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="{0}_calf" type="revolute"><parent link="{0}_thigh"/>
+<child link="{0}_shank"/><origin xyz="0 {1} -0.2"/><axis xyz="0 1 0"/>
+<limit lower="-2" upper="2" effort="50" velocity="20"/></joint>"""
+
+
+@pytest.mark.parametrize("right_first", [True, False])
+def test_legs_may_be_counted_by_their_names(tmp_path, right_first):
+    """The file has the right leg first, and pinocchio the left one: of legs that mirror
+    each other only the hips tell whose columns they are."""
+    text = '<robot name="r"><link name="base"/>' + LEG.format("r", -0.1)
+    (tmp_path / "r.urdf").write_text(text + LEG.format("l", 0.1) + "</robot>")
+    robot = read_robot(tmp_path / "r.urdf")
+    names = [j.name for j in robot.joints]
+    assert names == ["r.r_hip", "r.r_calf", "r.l_hip", "r.l_calf"]
+    t = np.arange(0.0, 12.0, 0.01)[:, None]
+    w, at = np.array([2.1, 3.3, 2.7, 3.9]), np.arange(4)
+    q, v, vd = (0.5 * np.sin(w * t + at), 0.5 * w * np.cos(w * t + at),
+                -0.5 * w**2 * np.sin(w * t + at))  # fmt: skip
+    effort = needed_efforts(robot.plant, q, v, vd)
+    effort += 0.01 * np.random.default_rng(3).normal(size=q.shape)
+    order = [0, 1, 2, 3] if right_first else [2, 3, 0, 1]
+    columns = [f"{what}_{k}" for what in ("q", "tau") for k in range(4)]
+    table = np.column_stack([t, q[:, order], effort[:, order]])
+    np.savetxt(tmp_path / "log.csv", table, "%.9g", ",",
+               header=",".join(["time", *columns]), comments="")  # fmt: skip
+    proposal = propose_scene(robot, [read_log(tmp_path / "log.csv")])
+    own = yaml.safe_load(proposal.sidecars[tmp_path / "log.csv"])["columns"]
+    found = [x["channel"] if isinstance(x, dict) else x for x in own.values()]
+    expected = [names[k] for k in order]
+    assert [x for x in found if x.endswith(".position")] == [
+        f"{name}.position" for name in expected
+    ]
+    said = [s.says for s in proposal.said if s.kind == "columns_mixed"]
+    assert said == [] if right_first else "counted limb by limb" in said[0]

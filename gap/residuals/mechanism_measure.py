@@ -55,6 +55,7 @@ def measure(
         scene, motion.recordings, WINDOW_SEC, most=240, slow_noise=slow_noise,
         simulation=_compiled(scene, [*moved, *effects]),
     )  # fmt: skip
+    widen(model, effects, slow_noise)
     taken = {(e.kind, tuple(e.at)) for e in effects}
     moved = [e for e in moved if (e.kind, tuple(e.at)) not in taken]
     trials = [moved, [*moved, *effects]] if effects else [moved]
@@ -92,6 +93,29 @@ def measure(
         ))  # fmt: skip
         gap = replace(gap, before=start, after=end, seconds=seconds)
     return gap, [], []
+
+
+def widen(model: WindowModel, effects: Sequence[Effect], slow_noise) -> None:
+    """Makes windows no surer than they are without what effects take away: what a
+    file's damping holds in the scene as it came runs away from the same small error
+    where the real joint has none."""
+    away = [
+        e for e in effects
+        if KINDS[e.kind].least is not None and min(e.parameters.values()) < 0.0
+    ]  # fmt: skip
+    if not away:
+        return
+    scene = replace(model.scene, effects=[*model.scene.effects, *away])
+    try:
+        other = WindowModel(
+            scene, model.recordings, WINDOW_SEC, most=240, slow_noise=slow_noise
+        )
+    except (ValueError, DoesNotFit):  # A scene that cannot have them.
+        return
+    model.windows = [
+        replace(w, std=np.maximum(w.std, o.std))
+        for w, o in zip(model.windows, other.windows, strict=True)
+    ]
 
 
 def _compiled(scene: Scene, effects: Sequence[Effect]) -> DrivenArmSimulation | None:
