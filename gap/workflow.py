@@ -88,7 +88,7 @@ from makebreak.gap.result import (
     Where,
 )
 from makebreak.gap.said import MANY_ALIKE, figure
-from makebreak.gap.search.choice import Choice, Selection
+from makebreak.gap.search.choice import Choice, Selection, is_sure
 from makebreak.gap.search.chosen_by_simulation import (
     above_step,
     chosen_by_simulation,
@@ -849,6 +849,10 @@ _TOO_SHORT_TO_REPORT = (
     "The recordings are too short to hold out a part for the report; without it "
     "nothing is named."
 )
+_UNSURE = (
+    "The error without it is no larger than noise and an uncertain start allow, and "
+    "none of its numbers is sure to three deviations."
+)
 _TOO_SHORT_TO_CHOOSE = (
     "The recordings are too short to hold out data for the choice of effects."
 )
@@ -880,6 +884,12 @@ def _withdrawn(
         why = f"It could not be judged by simulation. {facts.chosen_on.failure}"
     if why:
         return [(choice, why) for choice in selection.choices]
+    assert facts.chosen_on is not None
+    if below_noise(selection.choices, facts.start, facts.chosen_on):
+        # Nothing but the fit speaks for them.
+        unsure = [(c, _UNSURE) for c in selection.choices if not is_sure(c)]
+        if unsure:
+            return unsure
     closed = 1.0  # Windows say it twice where there are no equations.
     if problem.by_equations:
         closed = problem.closed(selection.start, selection.end)

@@ -142,7 +142,7 @@ LEG = """<link name="{0}_thigh"><inertial><origin xyz="0 {1} -0.03"/><mass value
 <origin xyz="0 {1} 0"/><axis xyz="1 0 0"/>
 <limit lower="-2" upper="2" effort="50" velocity="20"/></joint>
 <link name="{0}_shank"><inertial><origin xyz="0.01 0 -0.1"/><mass value="0.3"/>
-<inertia ixx="0.001" iyy="0.001" izz="0.0004" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<inertia ixx="0.001" iyy="0.001" izz="4e-4" ixy="0" ixz="0" iyz="0"/></inertial></link>
 <joint name="{0}_calf" type="revolute"><parent link="{0}_thigh"/>
 <child link="{0}_shank"/><origin xyz="0 {1} -0.2"/><axis xyz="0 1 0"/>
 <limit lower="-2" upper="2" effort="50" velocity="20"/></joint>"""

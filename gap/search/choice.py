@@ -206,6 +206,16 @@ def is_clearly_off(choice: Choice) -> bool:
     )
 
 
+def is_sure(choice: Choice) -> bool:
+    """Whether a number of an effect is MEMBER_Z deviations off its neutral value, or,
+    of one that has none, off 0."""
+    return any(
+        abs(choice.effect.parameters[p.name] - (p.neutral or 0.0)) > MEMBER_Z * spread
+        for p in KINDS[choice.effect.kind].parameters
+        if (spread := choice.std.get(p.name, np.inf)) < np.inf
+    )
+
+
 def identifiable(fit: Fitted, k: int = -1) -> int:
     """Number of parameters of effect k of a fit of which the data tell anything."""
     last, std = fit.effects[k], fit.std[k]
