@@ -2,6 +2,7 @@
 
 import warnings
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,11 +13,12 @@ from makebreak.gap.fit import fit_effects
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Nuisances, Outcome
 from makebreak.gap.result import GapMeasure, InUnits
-from makebreak.gap.search.choice import Choice, Selection
+from makebreak.gap.search.choice import Choice, Selection, is_sure
 from makebreak.gap.search.chosen_by_simulation import above_step
 from makebreak.gap.search.comparison import Comparison
 from makebreak.gap.search.drop import drop_needless, with_errors
 from makebreak.gap.verdict import Facts, decide, too_weak
+from makebreak.gap.workflow import _withdrawn
 from makebreak.models.effects.kind import Effect
 
 KIND, JOINTS = "joint_coulomb_friction", ("arm.j1", "arm.j2", "arm.j3")
@@ -386,3 +388,23 @@ def test_needless_effects_do_not_go_together_where_nuisances_cannot_be_so_far_of
     chosen, fitted = drop_needless(search, list(selection.choices), selection.end)
     assert [c.effect.at[0] for c in chosen][:1] == [JOINTS[0]] and len(chosen) == 2
     assert not search.is_strained(fitted)
+
+
+@pytest.mark.parametrize("std, sure", [(30.0, False), (15.0, True), (np.inf, False)])
+def test_a_number_that_is_three_deviations_off_what_says_nothing_is_sure(std, sure):
+    """Below the noise nothing but the fit speaks for an effect."""
+    parameters = {"stiffness": 53.0, "damping": 0.3}
+    effect = Effect("joint_elasticity", ["arm.j1"], parameters)
+    choice = Choice(
+        effect, {"stiffness": std, "damping": 2.0}, 1.0, 0.99, "", 1.0, (), (), 1
+    )
+    assert is_sure(choice) == sure
+    problem = SimpleNamespace(other_gravity=lambda end: ("", False), by_equations=False)
+    selection = Selection((choice,), None, None, Nuisances.none(1), [])
+    facts = Facts(
+        (choice,), 1.0, 0.99, far=False, chosen_on=GapMeasure(1.0, 0.99, 1.0, 0.3)
+    )
+    found = _withdrawn(problem, selection, facts)
+    assert [c for c, _ in found] == ([] if sure else [choice])
+    loud = replace(facts, start=9.0, chosen_on=GapMeasure(9.0, 0.99, 1.0, 0.3))
+    assert not _withdrawn(problem, selection, loud)
