@@ -13,6 +13,7 @@ from makebreak.gap.fit import fit_effects
 from makebreak.gap.numerics.selection import Screen
 from makebreak.gap.problem import Nuisances, Outcome
 from makebreak.gap.result import GapMeasure, InUnits
+from makebreak.gap.search import drop
 from makebreak.gap.search.choice import Choice, Selection, is_sure
 from makebreak.gap.search.chosen_by_simulation import above_step
 from makebreak.gap.search.comparison import Comparison
@@ -408,3 +409,23 @@ def test_a_number_that_is_three_deviations_off_what_says_nothing_is_sure(std, su
     assert [c for c, _ in found] == ([] if sure else [choice])
     loud = replace(facts, start=9.0, chosen_on=GapMeasure(9.0, 0.99, 1.0, 0.3))
     assert not _withdrawn(problem, selection, loud)
+
+
+@pytest.mark.parametrize("alone, kept", [(1.0, "spring"), (3.9, None)])
+def test_of_two_that_stand_for_each_other_one_is_asked_again(monkeypatch, alone, kept):
+    """Without both much is left; without either of them nothing, or as much."""
+    friction, bias, spring = (
+        Choice(Effect(kind, ["arm.j1"], {}), {}, 9.0, 1.0, "", 1.0, (), (), 1)
+        for kind in (KIND, "actuator_bias", "joint_spring")
+    )
+    left = {(2,): 1.1 * alone, (1,): alone, (1, 2): 4.0}
+    monkeypatch.setattr(
+        drop, "_by_columns", lambda *args: (left[tuple(args[-1])], None)
+    )
+    search = SimpleNamespace(
+        slopes=lambda chosen, current: None, error=lambda score: score, problem=None,
+        plan=SimpleNamespace(least_gain=0.1),
+    )  # fmt: skip
+    chosen = [friction, bias, spring]
+    found = drop._with_the_most_needed(search, chosen, None, [friction])
+    assert found == ([friction, spring] if kept else [friction])

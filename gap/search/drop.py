@@ -231,8 +231,8 @@ def keep_certain(
     search: Comparison, chosen: list[Choice], current: Fitted
 ) -> tuple[list[Choice], Fitted]:
     """The effects that are certain, by a fit of these alone. Effects that are not
-    significant are dropped together; after that, one after another, those that parts of
-    the data contradict."""
+    significant are dropped together, but for the most needed one, which is asked again
+    alone; after that, one after another, those that parts of the data contradict."""
     while chosen:
         current = search.refit(chosen, current)
         chosen = refreshed(chosen, current)
@@ -254,8 +254,35 @@ def keep_certain(
                 if not told[k] <= 1.0:
                     return chosen, current
             sure = [*chosen[:k], *chosen[k + 1 :]]
+        elif len(sure) + 1 < len(chosen):
+            sure = _with_the_most_needed(search, chosen, current, sure)
         chosen = _with_the_better_of_two(search, chosen, current, sure)
     return [], search.start
+
+
+def _with_the_most_needed(
+    search: Comparison, chosen: list[Choice], current: Fitted, sure: list[Choice]
+) -> list[Choice]:
+    """What is certain and, of several effects that are not, the one that explains most
+    without the others, if it is needed: of two that stand for each other (where a
+    spring rests, and a bias) neither is certain beside the other."""
+    names = {id(c) for c in sure}
+    gone = [k for k, c in enumerate(chosen) if id(c) not in names]
+    slopes = search.slopes(chosen, current)
+
+    def left(without: Sequence[int]) -> float:
+        return search.error(
+            _by_columns(search, search.problem, current, slopes, without)[0]
+        )
+
+    try:
+        alone = {k: left([i for i in gone if i != k]) for k in gone}
+        best = min(alone, key=lambda k: alone[k])
+        if alone[best] > (1.0 - search.plan.least_gain) * left(gone):
+            return sure
+    except ValueError:  # What is left would be no scene.
+        return sure
+    return [c for k, c in enumerate(chosen) if k == best or id(c) in names]
 
 
 def _with_the_better_of_two(
