@@ -92,6 +92,7 @@ class SceneDynamics:
             self._tree = None
         self._coulombs = coulomb_of(joint_laws(self.loaded.effects, self.plant))
         self._carriers: dict = {}
+        self._plain: SceneDynamics | None = None
         self._coordinates = _coordinates(self.plant)
 
     # ----- The model
@@ -327,13 +328,28 @@ class SceneDynamics:
                 mu = self.friction_of(at[0]) if kind == FRICTION else None
                 if mu is not None:
                     return {"friction": mu}
+            plain = self._before_loads() if entry.absolute else self
             effect = Effect(kind, list(at), {})
-            return dict(entry.now(effect, self.plant, self.loaded.scene_graph))
+            return dict(entry.now(effect, plain.plant, plain.loaded.scene_graph))
         return {
             each.name: each.neutral
             for each in entry.parameters
             if each.neutral is not None
         }
+
+    def _before_loads(self) -> "SceneDynamics":
+        """That of the scene without effects that add to bodies: what sets a body's own
+        mass is applied before them."""
+        if self._plain is None:
+            scene = self.loaded.scene
+            kept = [
+                e for e in scene.effects
+                if KINDS[e.kind].absolute or not KINDS[e.kind].weighs
+            ]  # fmt: skip
+            self._plain = self
+            if len(kept) < len(scene.effects):
+                self._plain = SceneDynamics(replace(scene, effects=kept))
+        return self._plain
 
     def least(self, kind: str, at: Sequence[str]) -> dict[str, float]:
         """Lower bounds of parameters from the model: an effect cannot remove more

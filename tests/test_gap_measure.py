@@ -13,7 +13,8 @@ from makebreak.gap.residuals.mechanism_measure import measure, widen
 from makebreak.gap.simulation.commands import Commands
 from makebreak.gap.simulation.scene_simulation import SceneSimulation
 from makebreak.gap.simulation.windows import WindowModel
-from makebreak.models.effects.kind import Effect
+from makebreak.models.dynamics import SceneDynamics
+from makebreak.models.effects.kind import Effect, one_dof_joints
 from makebreak.models.effects.transmission import twist_deviations, twists
 from makebreak.models.scene import InitialSection
 
@@ -95,3 +96,30 @@ def test_windows_are_no_surer_than_without_the_damping_that_a_file_has_in_vain(e
     more = Effect("joint_viscous_damping", ["p.j1"], {"damping": 9.0})
     assert np.all(std(less) >= std()) and std(less).max() > 1.2 * std().max()
     np.testing.assert_array_equal(std(more), std())
+
+
+@pytest.mark.parametrize("kind", ["object_mass", "object_com", "object_inertia"])
+def test_what_a_body_has_now_changes_nothing_beside_what_was_added_to_it(
+    tmp_path, kind
+):
+    """A repaired scene has a heavier link and a load: its own mass is set before these
+    are added, so the mass of both is not what it has."""
+    scene = pendulum(tmp_path)
+    plant = SceneDynamics(scene).plant
+    (joint,) = one_dof_joints(plant)
+    body = f"p.{joint.child_body().name()}"
+    added = [
+        Effect("link_mass", [body], {"mass": 0.3}),
+        Effect(
+            "payload", [body], {"mass": 0.4, "com_x": 0.1, "com_y": 0.0, "com_z": 0.2}
+        ),
+    ]
+    repaired = replace(scene, effects=added)
+    now = Effect(kind, [body], SceneDynamics(repaired).now(kind, [body]))
+    beside = replace(scene, effects=[*added, now])
+    q, v, vd = np.random.default_rng(1).normal(size=(3, 5, 1))
+    np.testing.assert_allclose(
+        SceneDynamics(beside).inverse_dynamics(q, v, vd),
+        SceneDynamics(repaired).inverse_dynamics(q, v, vd),
+        rtol=1e-9,
+    )

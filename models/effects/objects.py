@@ -258,7 +258,7 @@ def _inertial_signature(effect: Effect, model, motion, grid=None) -> list[Signat
     inertia about the body's origin depends on its square."""
     body = find_bodies(effect, model.plant)[0]
     M = body.default_spatial_inertia()
-    now = _inertial_now(effect, model.plant, None)
+    now = model.now(effect.kind, effect.at)
     names = list(now)
     if effect.kind == "object_mass":
         mix = mass_mix(M)
