@@ -103,8 +103,8 @@ def joined(limbs: Sequence[Sequence[str]], results: Sequence[GapResult]) -> GapR
     )  # fmt: skip
     results = _said_alike(results)
     effects = _effects(limbs, results)
-    compared = [r.gap.is_measured for r in results]
-    agree = [k for k, v in enumerate(verdicts) if v in AGREES and compared[k]]
+    agree = [k for k, r in enumerate(results)
+             if verdicts[k] in AGREES and r.gap.is_measured]  # fmt: skip
     words = [
         f"{_called(limbs[k])}: {r.says}"
         for k, r in enumerate(results) if k not in agree

@@ -340,15 +340,15 @@ class SceneDynamics:
     def _before_loads(self) -> "SceneDynamics":
         """That of the scene without effects that add to bodies: what sets a body's own
         mass is applied before them."""
+        scene = self.loaded.scene
+        kept = [
+            e for e in scene.effects
+            if KINDS[e.kind].absolute or not KINDS[e.kind].weighs
+        ]  # fmt: skip
+        if len(kept) == len(scene.effects):
+            return self
         if self._plain is None:
-            scene = self.loaded.scene
-            kept = [
-                e for e in scene.effects
-                if KINDS[e.kind].absolute or not KINDS[e.kind].weighs
-            ]  # fmt: skip
-            self._plain = self
-            if len(kept) < len(scene.effects):
-                self._plain = SceneDynamics(replace(scene, effects=kept))
+            self._plain = SceneDynamics(replace(scene, effects=kept))
         return self._plain
 
     def least(self, kind: str, at: Sequence[str]) -> dict[str, float]:

@@ -630,8 +630,13 @@ def _all_ordered(contents: Contents, matches, said) -> list[Match]:
 
 def _misfit(contents: Contents, efforts: Mapping[int, str]) -> float:
     """Mean logarithm of the shares that efforts leave."""
-    left = [x.left for x in _all_told(contents, efforts).values()]
-    return float(np.mean(np.log(np.maximum(left, LEAST_LEFT))))
+    return float(np.mean([*_logs_left(contents, efforts).values()]))
+
+
+def _logs_left(contents: Contents, efforts: Mapping[int, str]) -> dict[int, float]:
+    """{joint's number: logarithm of the share that its effort leaves}."""
+    told = _all_told(contents, efforts)
+    return {i: float(np.log(max(x.left, LEAST_LEFT))) for i, x in told.items()}
 
 
 def _rightly_read(contents: Contents, matches, said) -> list[Match]:
@@ -1182,9 +1187,7 @@ def left_by(plant, joints, columns, matches: Sequence[Match]) -> dict[str, float
         return {}
     efforts = _columns_of(contents, matches, _DRIVES)
     efforts = {i: name for i, name in efforts.items() if contents.moves(i)}
-    told = _all_told(contents, efforts)
-    return {joints[i].name: float(np.log(max(x.left, LEAST_LEFT)))
-            for i, x in told.items()}  # fmt: skip
+    return {joints[i].name: x for i, x in _logs_left(contents, efforts).items()}
 
 
 def told_by(contents: Contents, matches: Sequence[Match]) -> dict[str, Likeness]:

@@ -4,7 +4,6 @@ import json
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -589,7 +588,7 @@ def _numbered(robot: Robot, logs: Sequence[Log], said: list[Said]) -> Robot:
         return robot
     # Of mirrored limbs few joints tell whose columns they are: some are told clearly
     # better, and none clearly worse.
-    own, best, most = left(robot), "", 0.0
+    own, told = left(robot), dict[str, float]()
     for word, other in others.items():
         then = left(other)
         gains = {name: own.get(name, 0.0) - x for name, x in then.items()}
@@ -598,10 +597,9 @@ def _numbered(robot: Robot, logs: Sequence[Log], said: list[Said]) -> Robot:
             for name, gain in gains.items()
         )
         if is_told and min(gains.values()) > -np.log(CLEARER):
-            best, most = max(
-                (best, most), (word, sum(gains.values())), key=itemgetter(1)
-            )
-    if not best:
+            told[word] = sum(gains.values())
+    best = max(told, key=lambda word: told[word], default="")
+    if not best or told[best] <= 0.0:
         return robot
     says = f"By what is in them, columns without names are counted {best}."
     said.append(Said("columns_mixed", robot.joints[0].name, len(robot.joints), says))
