@@ -13,6 +13,7 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
+from makebreak.models.activation import Activation
 from makebreak.models.effects.kind import Effect
 from makebreak.models.meshes import write_obj
 
@@ -21,12 +22,15 @@ from makebreak.models.meshes import write_obj
 class FileDrive:
     """A joint's actuators in a file, at the joint: kp [N m/rad], kd [N m s/rad], both 0
     of a motor; limit [N m]; gear: joint effort over what the command of a motor says,
-    or of a servo the command over the joint's position."""
+    or of a servo the command over the joint's position; activation: of that command,
+    where it is not what the drive follows. gear 0: what the actuators make of their
+    commands is not known."""
 
     kp: float = 0.0
     kd: float = 0.0
     limit: float = np.inf
     gear: float = 1.0
+    activation: Activation | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -496,12 +500,13 @@ class _Writer:
                 name = self.name_of("joint", j)
                 known = drives.get(name)
                 if drive is None:
-                    drive = FileDrive()
+                    drive = FileDrive(gear=0.0)
                     lost.append(self.name_of("actuator", a))
                 if known is not None:  # A position and a velocity servo together.
                     drive = FileDrive(
                         known.kp + drive.kp, known.kd + drive.kd,
                         known.limit + drive.limit, known.gear,
+                        known.activation or drive.activation,
                     )  # fmt: skip
                 drives[name] = drive
             else:
@@ -532,11 +537,10 @@ class _Writer:
         gain, bias = m.actuator_gainprm[a], m.actuator_biasprm[a]
         affine = m.actuator_biastype[a] == mj.mjtBias.mjBIAS_AFFINE
         plain = m.actuator_biastype[a] == mj.mjtBias.mjBIAS_NONE
-        integrates = m.actuator_dyntype[a] == mj.mjtDyn.mjDYN_INTEGRATOR
         if not (
             gear
             and m.actuator_gaintype[a] == mj.mjtGain.mjGAIN_FIXED
-            and (m.actuator_dyntype[a] == mj.mjtDyn.mjDYN_NONE or integrates)
+            and int(m.actuator_dyntype[a]) in map(int, self._dynamics)
             and (affine or plain)
         ):
             return None
@@ -549,27 +553,41 @@ class _Writer:
             limits.append(float(np.abs(m.jnt_actfrcrange[j]).max()))
         if b0 or not g:
             return None
-        if b1:  # A servo of position: gain (ctrl - length), or of its integral.
+        act = self._activation(a)
+        if b1:  # A servo of position: gain (ctrl - length).
             if not np.isclose(b1, -g, rtol=1e-6) or b1 > 0.0 or b2 > 0.0:
                 return None
-            kp, kd = g * gear**2, -b2 * gear**2
-            if integrates:
-                self.notes.append(
-                    f"actuator {self.name_of('actuator', a)}: its command is a "
-                    "velocity that MuJoCo adds up to a position; here it follows a "
-                    "position"
-                )
-            return FileDrive(kp, kd, min(limits), gear)
-        if integrates:
-            return None
+            return FileDrive(g * gear**2, -b2 * gear**2, min(limits), gear, act)
         if b2:  # A servo of velocity.
             if not np.isclose(b2, -g, rtol=1e-6) or b2 > 0.0:
                 return None
-            return FileDrive(0.0, g * gear**2, min(limits), gear)
+            return FileDrive(0.0, g * gear**2, min(limits), gear, act)
         if m.actuator_ctrllimited[a]:
             most = float(np.abs(m.actuator_ctrlrange[a]).max())
             limits.append(most * abs(g * gear))
-        return FileDrive(0.0, 0.0, min(limits), g * gear)
+        return FileDrive(0.0, 0.0, min(limits), g * gear, act)
+
+    @property
+    def _dynamics(self):
+        kinds = self.mj.mjtDyn
+        return (
+            kinds.mjDYN_NONE, kinds.mjDYN_INTEGRATOR, kinds.mjDYN_FILTER,
+            kinds.mjDYN_FILTEREXACT,
+        )  # fmt: skip
+
+    def _activation(self, a: int) -> Activation | None:
+        """What an actuator follows in place of its ctrl."""
+        m, kind = self.m, self.m.actuator_dyntype[a]
+        if kind == self.mj.mjtDyn.mjDYN_NONE:
+            return None
+        integrates = kind == self.mj.mjtDyn.mjDYN_INTEGRATOR
+        lag = 0.0 if integrates else max(float(m.actuator_dynprm[a][0]), 1e-9)
+        at = m.actuator_actadr[a]
+        start = float(m.key_act[0][at]) if m.nkey else 0.0
+        low, high = -np.inf, np.inf
+        if m.actuator_actlimited[a]:
+            low, high = (float(x) for x in m.actuator_actrange[a])
+        return Activation(lag, start, low, high)
 
     def _home(self) -> dict[str, float]:
         m = self.m

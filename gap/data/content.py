@@ -236,8 +236,8 @@ class Contents:
         names = [f"{j.name}.position" for j in joints]
         if plant.num_positions() != len(joints) or not {*names, "time"} <= {*found}:
             raise ValueError("not all joints are measured")
-        time = _si(columns, found["time"])
-        q = np.stack([_si(columns, found[name]) for name in names], axis=1)
+        time = found["time"].values(columns)
+        q = np.stack([found[name].values(columns) for name in names], axis=1)
         for i, joint in enumerate(joints):
             if not joint.prismatic:
                 q[:, i] = without_turns(q[:, i])[0]
@@ -388,10 +388,6 @@ def _range(y: np.ndarray) -> float:
     return float(np.ptp(y[np.isfinite(y)])) if np.isfinite(y).any() else 0.0
 
 
-def _si(columns, match: Match) -> np.ndarray:
-    return match.scale * columns[match.column] + match.offset
-
-
 def by_content(
     plant: MultibodyPlant,
     joints: Sequence[JointName],
@@ -462,10 +458,10 @@ def _without_empty(columns, matches: Sequence[Match], said) -> list[Match]:
         own = position.get(f"{at}.position")
         if what not in (*_DRIVES, "position_command", "velocity_command"):
             continue
-        y = columns[match.column]
+        y = match.values(columns) if match.activation else columns[match.column]
         y = y[np.isfinite(y)]
         # One that is held gives way a little.
-        moves = own is not None and _range(_si(columns, own)) > GIVES_WAY
+        moves = own is not None and _range(own.values(columns)) > GIVES_WAY
         if len(y) and (np.ptp(y) > 0.0 or not moves) or match.why == AS_SAID:
             continue
         if follows.get(match.column, np.inf) <= near:
@@ -489,7 +485,7 @@ def _follows(columns, matches: Sequence[Match], position) -> dict[str, float]:
         at, _, what = (match.channel or "").rpartition(".")
         own = position.get(f"{at}.position")
         if what == "position_command" and own is not None:
-            off = _si(columns, own) - _si(columns, match)
+            off = own.values(columns) - match.values(columns)
             if (there := off[np.isfinite(off)]).size:
                 found[match.column] = float(np.sqrt(np.mean(there**2)))
     return found

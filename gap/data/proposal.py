@@ -14,6 +14,7 @@ from makebreak.gap.data.arrays import TIME_WORDS, words_of
 from makebreak.gap.data.bags import MotorRange
 from makebreak.gap.data.csv_table import is_nameless
 from makebreak.gap.data.match import AS_SAID, JointName, Match, plain_name
+from makebreak.gap.data.sidecar import activation_said, activation_text
 from makebreak.gap.data.stamps import is_backward
 from makebreak.gap.data.table import COMMANDS, is_channel
 from makebreak.gap.data.units import DEGREES, in_units, quantity_of_unit, unit_in_name
@@ -139,6 +140,7 @@ def said_of(columns: Mapping) -> dict[str, Match]:
         found[str(name)] = Match(
             str(name), own.get("channel"), float(own.get("scale", 1.0)),
             float(own.get("offset", 0.0)), AS_SAID,
+            activation=activation_said(f'columns, "{name}":', own),
         )  # fmt: skip
     return found
 
@@ -188,11 +190,14 @@ def sidecar_text(matches: Sequence[Match], own: Mapping | None = None) -> str:
         key = _quoted(match.column)
         if match.channel is None:
             target = "null"
-        elif match.scale == 1.0 and match.offset == 0.0:
+        elif (match.scale, match.offset, match.activation) == (1.0, 0.0, None):
             target = match.channel
         else:
             target = f"{{channel: {match.channel}, scale: {match.scale!r}"
-            target += f", offset: {match.offset!r}}}" if match.offset else "}"
+            target += f", offset: {match.offset!r}" if match.offset else ""
+            if match.activation is not None:
+                target += f", {activation_text(match.activation)}"
+            target += "}"
         if target == match.column:
             continue
         lines.append(f"  {key}: {target}  # {match.why}")

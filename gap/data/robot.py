@@ -63,12 +63,14 @@ from makebreak.gap.data.servo_gains import (
 )
 from makebreak.gap.data.sidecar import Found, read_sidecars, sidecar_for
 from makebreak.gap.data.table import (
+    COMMANDS,
     JOINT_QUANTITIES,
     RecordingTable,
     is_channel,
     stem_of,
 )
 from makebreak.gap.data.units import DEG, FULL_RANGE, in_units, said_of_units
+from makebreak.models.activation import Activation
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.joints import ROTOR
 from makebreak.models.effects.kind import actuator_of, one_dof_joints, unit_at
@@ -447,7 +449,9 @@ def judge_logs(robot: Robot, logs: Sequence[Log]) -> Judged:
     every = {path: _of_bodies(robot, own) for path, own in every.items()}
     unused = dict.fromkeys(m.column for matches in every.values() for m in matches
                            if m.why.endswith(UNKNOWN_JOINT))  # fmt: skip
-    every = {path: _through_gears(robot, own) for path, own in every.items()}
+    every = {
+        log.path: _through_drives(robot, log, every[log.path], said) for log in logs
+    }
     for base, pose in robot.poses.items():
         if base in robot.free or pose.is_still:
             continue
@@ -482,6 +486,7 @@ def judge_logs(robot: Robot, logs: Sequence[Log]) -> Judged:
             and not (robot.free and each.kind in (FROM_A_START, UNEXPLAINED))
         ]  # fmt: skip
     servos, in_lines = _servos_of_efforts(robot, every, logs, said)
+    in_lines |= any(m.activation for matches in every.values() for m in matches)
     most: dict[str, float] = {}
     for name, y in (x for log in logs for x in _scaled(log, every[log.path]).items()):
         joint, _, what = name.rpartition(".")
@@ -921,30 +926,71 @@ def _effects_of_file(robot: Robot, fixed, lines: Sequence[str]) -> list[str]:
     return out
 
 
-def _through_gears(robot: Robot, matches: Sequence[Match]) -> list[Match]:
+def _through_drives(
+    robot: Robot, log: Log, matches: Sequence[Match], said: list[Said]
+) -> list[Match]:
     """Commands of a file's own actuators (MJCF's ctrl) as efforts, positions and
-    velocities of the joints, by what each actuator takes: an effort times the gear, a
-    servo's command over it."""
-    out = []
+    velocities of the joints, by what each actuator takes, an effort times the gear or a
+    servo's command over it, and makes of it (Activation)."""
+    out, of = [], {m.channel: m for m in matches if m.channel}
+    clock, file = of.get("time"), robot.path.name
     for match in matches:
         at, _, what = (match.channel or "").rpartition(".")
         drive = robot.file.drives.get(at.partition(".")[2])
-        scale = 1.0
-        if drive is not None and match.why != AS_SAID:
-            if what == "effort_command" and "ctrl" in words_of(match.column):
-                if drive.kp or drive.kd:
-                    what = "position_command" if drive.kp else "velocity_command"
-                    why = f"what {robot.path.name}'s own actuator takes"
-                    match = replace(match, channel=f"{at}.{what}", why=why)
-            if what == "effort_command" and not drive.kp and not drive.kd:
+        if match.why == AS_SAID:
+            drive = None
+        scale, act = 1.0, None
+        if drive is not None and not drive.gear and "ctrl" in words_of(match.column):
+            why = f"what {file}'s actuator makes of it is not known"
+            match, drive = replace(match, channel=None, why=why), None
+        if drive is not None and what in COMMANDS:
+            is_own = what == "effort_command" and "ctrl" in words_of(match.column)
+            act, servo = drive.activation, drive.kp or drive.kd
+            adds_up = act is not None and not act.lag
+            if is_own and servo or adds_up and drive.kp and what == "velocity_command":
+                what = "position_command" if drive.kp else "velocity_command"
+                why = f"what {file}'s own actuator takes"
+                match = replace(match, channel=f"{at}.{what}", why=why)
+            elif adds_up and not is_own:  # What it is added up to.
+                act = None
+            if what == "effort_command" and not servo:
                 scale = drive.gear
-            elif what == "position_command" and drive.kp:
+            elif what == ("position_command" if drive.kp else "velocity_command"):
                 scale = 1.0 / drive.gear
         if drive is not None and scale != 1.0:
-            why = f"{match.why}; by the gear {drive.gear:g} of {robot.path.name}"
+            why = f"{match.why}; by the gear {drive.gear:g} of {file}"
             match = replace(match, scale=match.scale * scale, why=why)
+        if act is not None:
+            act = act.over(1.0 / scale)
+            if what == "position_command" and clock and f"{at}.position" in of:
+                position = of[f"{at}.position"].values(log.table.columns)
+                act = _begun(replace(match, clock=clock), act, position, log)
+            how = f"lags behind it by {act.lag:g} s" if act.lag else "adds it up"
+            says = (
+                f"{match.column}: {file}'s actuator of {at} {how}, from {act.start:g} "
+                "on, as the proposed sidecar has it"
+            )
+            said.append(Said("activation", at, act.start, says))
+            why = f"{match.why}, which {how}"
+            match = replace(match, activation=act, why=why)
+        if match.activation is not None:
+            match = replace(match, clock=clock)
         out.append(match)
     return out
+
+
+def _begun(
+    match: Match, activation: Activation, position: np.ndarray, log: Log
+) -> Activation:
+    """From the file's start, or from where the joint is at first: with that from which
+    the command is nearer to its position (n,)."""
+    there = position[np.isfinite(position)]
+    tries = [replace(activation, start=start)
+             for start in (activation.start, *there[:1].tolist())]  # fmt: skip
+    commands = [replace(match, activation=one).values(log.table.columns)
+                for one in tries]  # fmt: skip
+    off = [np.nanmean((command - position) ** 2) for command in commands]
+    return tries[int(np.argmin(off))]
 
 
 def _check_currents(
@@ -1036,12 +1082,10 @@ def _actuation(judged: Judged, kinds, logs, notes: list[str]) -> tuple[list[str]
             f"no column says what drives {', '.join(rest)}: in this scene nothing does"
         )
     if joints := named("position_command"):
-        held = ["  hold: first_order  # By the measured efforts."]
-        held = held if judged.in_lines else []
-        if held:
-            notes.append(
-                "commands go in straight lines from row to row (by the efforts)"
-            )
+        held = []
+        if judged.in_lines:
+            held = ["  hold: first_order  # Commands between rows."]
+            notes.append("commands go in straight lines from row to row")
         gains = servos or _gains_by_motion(robot, every, logs)
         stiff = {} if servos else _stiffness(robot, every, logs)
         stiff |= {joint: own.kp for joint, own in gains.items()}
@@ -1101,6 +1145,11 @@ def _actuation(judged: Judged, kinds, logs, notes: list[str]) -> tuple[list[str]
             )
         return lines, "" if every_one else told
     if joints := named("velocity_command"):
+        file = {f"{robot.model}.{j}": d for j, d in robot.file.drives.items()}
+        if all(j in file and file[j].kd and not file[j].kp for j in joints):
+            lines = _servos_of_file(robot, joints, file, notes, "velocity")
+            return [*lines, *_limits({j: file[j].limit for j in joints}, judged.most,
+                                     notes)], ""  # fmt: skip
         notes.append("drives follow velocities, with gains that are a guess")
         moved = _inertia(robot)
         kd = [float(f"{SPEED_LOOP * moved[j]:.2g}") for j in joints]
@@ -1116,15 +1165,19 @@ def _actuation(judged: Judged, kinds, logs, notes: list[str]) -> tuple[list[str]
     return NO_ACTUATION, ""
 
 
-def _servos_of_file(robot: Robot, joints, drives, notes: list[str]) -> list[str]:
-    """Lines of position servos whose gains are in the file."""
-    notes.append(f"drives are the position servos of {robot.path.name}")
+def _servos_of_file(
+    robot: Robot, joints, drives, notes: list[str], kind: str = "servo"
+) -> list[str]:
+    """Lines of servos of position, or of velocity, whose gains are in the file."""
+    what = "position" if kind == "servo" else "velocity"
+    notes.append(f"drives are the {what} servos of {robot.path.name}")
     of_kp, of_kd = _units(robot, joints)
+    kp = f"  kp: {[float(drives[j].kp) for j in joints]}  # [{of_kp}]"
     return [
         "actuation:",
-        "  type: servo  # From the file.",
+        f"  type: {kind}  # From the file.",
         f"  joints: [{', '.join(joints)}]",
-        f"  kp: {[float(drives[j].kp) for j in joints]}  # [{of_kp}]",
+        *([kp] if kind == "servo" else []),
         f"  kd: {[float(drives[j].kd) for j in joints]}  # [{of_kd}]",
     ]
 
@@ -1182,11 +1235,7 @@ def _inertia(robot: Robot) -> dict[str, float]:
 
 def _scaled(log: Log, matches: Sequence[Match]) -> dict[str, np.ndarray]:
     """{channel: its samples in SI units}."""
-    return {
-        m.channel: m.scale * log.table.columns[m.column] + m.offset
-        for m in matches
-        if m.channel
-    }
+    return {m.channel: m.values(log.table.columns) for m in matches if m.channel}
 
 
 def _untold(

@@ -11,13 +11,16 @@ from typing import Any
 import numpy as np
 import yaml
 
+from makebreak.gap.data.match import follow
 from makebreak.gap.data.recording import WrenchAsLogged
 from makebreak.gap.data.table import stem_of
+from makebreak.models.activation import Activation
 
 _SECTIONS = (
     "noise", "filters", "columns", "wrench", "ignore", "join", "provenance",
     "calibration", "rate_hz",
 )  # fmt: skip
+_OF_COLUMN = ("channel", "scale", "offset", "add_up_from", "lag", "from", "between")
 _OF_ONE_LOG = ("ignore", "join", "provenance")
 _AS_WRITTEN = ("provenance", "rate_hz")
 
@@ -295,9 +298,10 @@ def renamed(
     """The columns under our names.
 
     names: {foreign: ours}, {foreign: null} to leave one out, or {foreign: {channel:
-    ours, scale: factor, offset: added after it}}.
+    ours, scale: factor, offset: added after it}}, and what activation_said reads.
     """
     file, result = sidecar_of(path), {}
+    followed: dict[str, Activation] = {}
     for foreign in names:
         if foreign not in columns and foreign not in unused:
             raise ValueError(
@@ -309,7 +313,10 @@ def renamed(
         if target is None:
             continue
         if isinstance(target, dict):
-            value, target = _scaled(f'{file}: columns, "{name}":', value, target)
+            what = f'{file}: columns, "{name}":'
+            value, target, activation = _scaled(what, value, target)
+            if activation is not None:
+                followed[str(target)] = activation
         if not isinstance(target, str):
             raise ValueError(
                 f'{file}: columns, "{name}": got {target}, expected the name of a '
@@ -318,17 +325,61 @@ def renamed(
         if target in result:
             raise ValueError(f'{file}: two columns are mapped to "{target}"')
         result[target] = value
+    for name, activation in followed.items():
+        if "time" not in result:
+            raise ValueError(f"{file}: {name} needs the column time")
+        result[name] = follow(activation, name, result[name], result["time"])
     return result
 
 
-def _scaled(what: str, value: np.ndarray, said: Mapping) -> tuple[np.ndarray, str]:
-    """A column in our unit, and its channel: {channel, scale, offset} applied."""
-    if set(said) - {"channel", "scale", "offset"} or "channel" not in said:
+def activation_said(what: str, said: Mapping) -> Activation | None:
+    """Of {add_up_from: start [rad]} or {lag: [s], from: start}, with between: [low,
+    high].
+
+    Raises: ValueError, one line.
+    """
+    if not {"add_up_from", "lag"} & set(said):
+        return None
+    lag = _finite_number(f"{what} lag", said.get("lag", 0.0), least=0.0)
+    start = said.get("add_up_from", said.get("from", 0.0))
+    start = _finite_number(f"{what} where it begins", start)
+    between = said.get("between", (-np.inf, np.inf))
+    try:
+        low, high = (float(x) for x in between)
+        good = low <= high
+    except (TypeError, ValueError):
+        good = False
+    if not good:
+        raise ValueError(f"{what} between is {between!r}, expected [low, high]")
+    if ("lag" in said) == ("add_up_from" in said) or ("lag" in said and not lag):
+        raise ValueError(f"{what} expected add_up_from, or a lag above 0 s")
+    return Activation(lag, start, low, high)
+
+
+def activation_text(activation: Activation) -> str:
+    """As activation_said reads it, without braces."""
+    text = f"add_up_from: {activation.start!r}"
+    if activation.lag:
+        text = f"lag: {activation.lag!r}, from: {activation.start!r}"
+    if np.isfinite([activation.low, activation.high]).any():
+        ends = (f"{x!r}" if np.isfinite(x) else f"{'-' * (x < 0)}.inf"
+                for x in (activation.low, activation.high))  # fmt: skip
+        text += f", between: [{', '.join(ends)}]"
+    return text
+
+
+def _scaled(
+    what: str, value: np.ndarray, said: Mapping
+) -> tuple[np.ndarray, str, Activation | None]:
+    """A column in our unit, and its channel: {channel, scale, offset} applied; and what
+    is to be made of it when all columns are known."""
+    if set(said) - {*_OF_COLUMN} or "channel" not in said:
         raise ValueError(
-            f"{what} got {sorted(said)}, expected channel, and scale or offset"
+            f"{what} got {sorted(said)}, expected channel, and some of "
+            f"{', '.join(_OF_COLUMN[1:])}"
         )
     scale = _finite_number(f"{what} scale", said.get("scale", 1.0))
     if scale == 0.0:
         raise ValueError(f"{what} scale is 0, which leaves nothing")
     offset = _finite_number(f"{what} offset", said.get("offset", 0.0))
-    return scale * value + offset, said["channel"]
+    return scale * value + offset, said["channel"], activation_said(what, said)
