@@ -143,6 +143,28 @@ def test_a_json_with_a_number_beside_its_rows_has_the_time_of_it(tmp_path):
     np.testing.assert_array_equal(columns["q/knee"], Q[:, 1])
 
 
+@pytest.mark.parametrize("n", [1, 3])
+def test_objects_with_columns_of_their_own_are_episodes(tmp_path, n):
+    lengths = [40, 25, 60][:n]
+    runs = [{"type": "step", "targets": [], "goal": Q[:k, 1].tolist(),
+             "q": Q[:k].tolist()} for k in lengths]  # fmt: skip
+    content = {"config": {"control_hz": 200, "limits": [0.1, 0.2]}, "data": runs}
+    (tmp_path / "a.json").write_text(json.dumps(content))
+    columns = read_table(tmp_path / "a.json").columns
+    q = np.concatenate([Q[:k, 0] for k in lengths])
+    np.testing.assert_array_equal(columns["q[0]"], q)
+    assert np.diff(columns["time"])[0] == pytest.approx(0.005)
+    if n > 1:
+        np.testing.assert_array_equal(columns["episode"], np.repeat(range(n), lengths))
+    assert ("episode" in columns) == (n > 1)
+
+
+def test_objects_with_names_are_joints_and_no_episodes(tmp_path):
+    joints = [{"joint": n, "q": y.tolist()} for n, y in zip(NAMES, Q.T, strict=True)]
+    (tmp_path / "a.json").write_text(json.dumps({"dt": 0.01, "joints": joints}))
+    assert "episode" not in read_table(tmp_path / "a.json").columns
+
+
 @pytest.mark.parametrize("text, says", [
     ("{", "no JSON"), ("3", "no columns"), ('{"a": "b"}', "no array of numbers"),
     ("[" * 100_000, "no JSON"), ("[]", "no columns"),

@@ -58,7 +58,7 @@ def test_columns_are_known_by_the_motion_and_the_model(
 ):
     found, expected, said = proposed(tmp_path, blocks, by_joint, timed)
     assert found == expected
-    assert "log.csv names no columns" in said[0]
+    assert "log.csv does not name its columns" in said[0]
 
 
 def test_accelerations_and_what_says_nothing_are_left_out(tmp_path):
@@ -177,3 +177,30 @@ def test_legs_may_be_counted_by_their_names(tmp_path, right_first):
     ]
     said = [s.says for s in proposal.said if s.kind == "columns_mixed"]
     assert said == [] if right_first else "counted limb by limb" in said[0]
+
+
+@pytest.mark.parametrize("behind, taken", [(12, True), (None, False)])
+def test_the_only_column_that_goes_after_a_command_is_the_position(
+    tmp_path, behind, taken
+):
+    rng = np.random.default_rng(3)
+    command = np.repeat(rng.uniform(-0.5, 0.5, 20), 30)
+    y = rng.normal(size=600).cumsum()
+    if behind is not None:
+        y = np.roll(np.convolve(command, np.ones(9) / 9.0, "same"), behind)
+    robot = """<mujoco><worldbody><body><joint name="j" axis="0 1 0"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.03"/></body></worldbody>
+        <actuator><position joint="j" kp="20" kv="2"/></actuator></mujoco>"""
+    (tmp_path / "a.xml").write_text(robot)
+    rows = zip(0.01 * np.arange(600), command, y, strict=True)
+    text = "\n".join(",".join(map(str, row)) for row in rows)
+    (tmp_path / "log.csv").write_text(f"time,actions,sensor_data\n{text}\n")
+    read = read_log(tmp_path / "log.csv")
+    if not taken:
+        with pytest.raises(ValueError, match="no column looks like the position"):
+            propose_scene(read_robot(tmp_path / "a.xml"), [read])
+        return
+    proposal = propose_scene(read_robot(tmp_path / "a.xml"), [read])
+    own = yaml.safe_load(proposal.sidecars[read.path])["columns"]
+    assert own["sensor_data"] == "a.j.position"
+    assert own["actions"] == "a.j.position_command"

@@ -164,8 +164,8 @@ def read_lines(path: Path, most_cells: int, unused: frozenset[str]) -> Read:
 
 
 def read_json(path: Path, most_cells: int, unused: frozenset[str]) -> Read:
-    """The same of one JSON document: arrays by name, or the longest list of objects in
-    it, an object a row.
+    """The same of one JSON document: arrays by name, of a list of objects with such
+    each an episode, or the longest list of objects in it, an object a row.
 
     Raises: ValueError, one line.
     """
@@ -173,8 +173,46 @@ def read_json(path: Path, most_cells: int, unused: frozenset[str]) -> Read:
         content = json.loads(path.read_text(errors="replace"))
     except (ValueError, RecursionError) as error:
         raise ValueError(f"recording {path} is no JSON: {error}") from None
-    rows = max(_lists_of_objects(content), key=len, default=[])
+    rows: list = []
+    if episodes := next(_lists_of_episodes(content), None):
+        content = _without(content, episodes) | _one_after_another(episodes)
+    else:
+        rows = max(_lists_of_objects(content), key=len, default=[])
     return _of_rows(path, rows, _without(content, rows), most_cells, unused)
+
+
+def _lists_of_episodes(value) -> Iterator[list[dict]]:
+    """Lists of objects, wherever they are in a document, that have the same columns and
+    no name of their own (as one for each joint has)."""
+    if isinstance(value, list) and value and all(isinstance(x, dict) for x in value):
+        own = [_columns_in(each) for each in value]
+        if own[0] and all(x.keys() == own[0].keys() for x in own):
+            if not {"label", "name", "joint"} & {*value[0]}:
+                yield value
+                return
+    below = value.values() if isinstance(value, dict) else value
+    for each in below if isinstance(value, dict | list) else ():
+        if isinstance(each, dict | list):
+            yield from _lists_of_episodes(each)
+
+
+def _columns_in(value: Mapping) -> dict[str, list]:
+    """Lists of the longest kind that an object has, of a row's numbers each."""
+    lists = {k: v for k, v in _leaves("", value)
+             if isinstance(v, list) and len(v) >= FEWEST
+             and not isinstance(v[0], str | dict)}  # fmt: skip
+    n = max(map(len, lists.values()), default=0)
+    return {k: v for k, v in lists.items() if len(v) == n}
+
+
+def _one_after_another(episodes: Sequence[Mapping]) -> dict[str, list]:
+    """Columns of all episodes, and which a row is of, where they are several."""
+    parts = [_columns_in(each) for each in episodes]
+    columns = {k: [x for part in parts for x in part[k]] for k in parts[0]}
+    if len(parts) > 1 and "episode" not in columns:
+        counts = [len(next(iter(part.values()))) for part in parts]
+        columns["episode"] = np.repeat(np.arange(len(parts)), counts).tolist()
+    return columns
 
 
 def _lists_of_objects(value) -> Iterator[list]:
@@ -190,7 +228,7 @@ def _lists_of_objects(value) -> Iterator[list]:
             yield from _lists_of_objects(each)
 
 
-def _without(value, rows: list):
+def _without(value, rows: list) -> dict:
     """A document less one of its lists."""
     if value is rows:
         return {}

@@ -16,6 +16,7 @@ from makebreak.gap.data.match import JointName, Match
 from makebreak.gap.data.proposal import UNKNOWN_JOINT
 
 ALIKE = 0.97  # Squared correlation of a position with its velocity's integral.
+LATE, LIKE_IT = 50, 0.7  # Rows that a joint is behind its command; correlation.
 FOLLOWS = 0.05  # Of a joint's range, how far it stays behind its command.
 BY_CONTENT = "the file has no names; by what is in it"
 
@@ -29,7 +30,8 @@ def layouts(
 ) -> list[tuple[dict[str, str], list[Match]]]:
     """{quantity: its first column}, and matches of all columns, for each way in which
     columns that are numbered (column_1, state[0]) may be laid out; none where others
-    are unknown, too, or numbers are no more than joints.
+    are unknown, too, or numbers are no more than joints. Where positions are commanded,
+    as many columns as joints that go after these are the positions.
 
     Args: columns {name: (n,)} and their matches; joints in the robot's order.
     """
@@ -43,13 +45,20 @@ def layouts(
     time = next((m for m in matches if m.channel == "time"), None)
     names = [m.column for m in matches if m.channel is None]
     is_known = any((m.channel or "").endswith(".position") for m in matches)
-    if time is None or is_known or len(names) < n or not all(map(_stem, names)):
+    numbered = n == 1 or all(map(_stem, names))
+    if time is None or is_known or len(names) < n or not numbered:
         return []
     X = np.stack([columns[name] for name in names], axis=1)
     t = time.scale * columns[time.column]
     good = np.isfinite(X).all(axis=1) & np.isfinite(t)
     found = []
-    for layout in _layouts(t[good], X[good], n):
+    commands = [columns[m.column][good] for j in joints for m in matches
+                if m.channel == f"{j.name}.position_command"]  # fmt: skip
+    only = len(names) == n == len(commands) and all(
+        _goes_after(*pair) for pair in zip(commands, X[good].T, strict=True)
+    )
+    each = [{"position": (0, 1)}] if only else _layouts(t[good], X[good], n)
+    for layout in each:
         channel = {
             names[first + k * step]: f"{joint.name}.{quantity}"
             for quantity, (first, step) in layout.items()
@@ -69,6 +78,19 @@ def _stem(name: str) -> str:
     """Of a name that ends with a number, what is before that; else nothing."""
     found = re.fullmatch(r"(.*?)\d+\W*", name)
     return found.group(1) if found else ""
+
+
+def _goes_after(command: np.ndarray, y: np.ndarray) -> bool:
+    """Whether y (m,) is like a command so many rows before, of up to LATE."""
+
+    def alike(late: int) -> float:
+        one, other = command[: len(y) - late], y[late:]
+        size = np.std(one) * np.std(other)
+        return float(np.mean((one - one.mean()) * (other - other.mean())) / size)
+
+    if not (np.ptp(y) > 0.0 and np.ptp(command) > 0.0):
+        return False
+    return max(map(alike, range(min(LATE, len(y) // 2)))) > LIKE_IT
 
 
 def _layouts(t: np.ndarray, X: np.ndarray, n: int) -> Iterator[Layout]:

@@ -22,7 +22,7 @@ from makebreak.gap.data.units import DEGREES, in_units, quantity_of_unit, unit_i
 UNKNOWN_JOINT = "of an unknown joint"  # Why such a column is left out.
 _COMMAND = set(
     "cmd command commands commanded target desired des ref reference goal goals "
-    "setpoint action sp control soll sollwert".split()
+    "setpoint action actions sp control soll sollwert".split()
 )
 _WORDS = {
     "acceleration": set("acc acceleration accelerations ddq qdd accel".split()),
@@ -37,7 +37,7 @@ _WORDS = {
     ),
     "position": set(
         "position positions pos q qpos angle angles theta phi rad state states "
-        "joint joints axis axes encoder action".split()
+        "joint joints axis axes encoder action actions".split()
     )
     | {*DEGREES},
 }

@@ -641,10 +641,13 @@ def _named(log: Log, robot: Robot, said: list[Said]) -> list[Match]:
         left = float(np.mean([*each])) if each else 0.0
         tried.append((left if left < np.log(NOTHING) else 0.0, first, own))
     left, first, best = min(tried, key=lambda each: each[0], default=(0.0, {}, []))
-    if left == 0.0 and "velocity" not in first:
+    if left == 0.0 and "velocity" not in first and [*first] != ["position"]:
         return matches
     shown = ", ".join(f"{what} ({column} and on)" for what, column in first.items())
-    says = f"{log.path.name} names no columns. By what is in them they are {shown}."
+    says = (
+        f"{log.path.name} does not name its columns, or in words that are not known. "
+        f"By what is in them they are {shown}."
+    )
     used = {m.column for m in best if m.channel}
     also = [
         other["effort_measured"] for share, other, own in tried
