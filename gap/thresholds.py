@@ -77,8 +77,6 @@ NEEDED_Z = 5.0
 # Both of two rivals are named only if the second takes this share off the held-out
 # error that the first one leaves (the same pushes).
 PAIR_GAIN = 0.02
-# Ties from which the search goes on once more, where much is left at its end.
-BRANCHES_MAX = 4
 # Rivals that are tried in the place of one of two effects that were added at once.
 PAIR_RIVALS_MAX = 3
 

@@ -367,7 +367,7 @@ def test_what_users_import_has_docstrings_and_the_rest_gets_no_worse():
                 missing.append(name)  # What `dataclass` writes is none.
     assert missing == []
     # Lower this number with each one that is written.
-    assert len(public_without_docstring(ROOT)) <= 198
+    assert len(public_without_docstring(ROOT)) <= 194
 
 
 def test_a_definition_without_a_docstring_is_found(tmp_path):
@@ -443,4 +443,4 @@ def test_each_change_is_in_a_group_of_the_changelog():
 
 def test_one_person_can_hold_the_gap_method_in_the_head():
     words = (ROOT / "docs" / "gap_method.md").read_text().split()
-    assert len(words) <= 2900
+    assert len(words) <= 2800

@@ -6,7 +6,7 @@ The stages, each in a file of its own:
 
     screen.py       candidates, ranked by their linear columns
     groups.py       one kind at all joints as one candidate
-    forward.py      step by step, and back to a tie where much is left
+    forward.py      step by step
     add.py          one step: rank, fit the best exactly, take the simplest
     trials.py       exact fits, and which of them is the simplest
     rivals.py       needed instead, both needed, or a tie
@@ -49,7 +49,7 @@ def select(
     whatever is not needed any more is dropped."""
     search = Comparison(problem, say)
     path = forward(search)
-    chosen, current = reweighed(search, list(path.end.chosen), path.end.fitted)
+    chosen, current = reweighed(search, list(path.chosen), path.fitted)
     with search.budget.part(PRUNE):
         chosen, current = _pruned(search, chosen, current)
         chosen = search.budget.if_time(
