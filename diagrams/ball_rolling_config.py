@@ -117,8 +117,9 @@ class RollingParametersConfig:
 
     # Deviation of the logarithm of the ball's mass.
     mass: float = 0.5
-    # Deviation of the logarithm of the friction of tip and ball, and of ball and table.
-    friction: float = 0.5
+    # Deviation of the logarithm of the friction of tip and ball, and of ball and table:
+    # planner.friction is chosen to plan with, and nobody has measured it.
+    friction: float = 1.0
     # Deviation of the lever arm of the ball's rolling resistance on the table [m].
     rolling: float = 3e-4
     gap: float = 0.005  # Deviation of the distance of tip and ball [m].
@@ -386,10 +387,11 @@ def parameter_learner_config(
     items: list[Parameter],
 ) -> ParameterLearnerConfig:
     """The weights are those of the residual's learner; the tip's motion along the table
-    weighs as the ball's, and the ball's turning as its rolling."""
+    weighs as the ball's, and so do the ball's turning, as its rolling, and its staying
+    on the table: what it is pressed with there is what resists its rolling."""
     Q_d = np.array(learner_config(config.learning).Q_d)
     ball = Q_d[V_BALL.start]
-    Q_d[V_TIP.start : V_TIP.start + 2] = ball
+    Q_d[V_TIP.start : V_TIP.start + 2] = Q_d[V_BALL] = ball
     Q_d[W_BALL.start : W_BALL.start + 2] = ball * ball_radius**2
     return ParameterLearnerConfig(
         pairs,

@@ -11,6 +11,10 @@ from pydrake.systems.primitives import ConstantVectorSource
 from makebreak.benchmarks import parameter_learner as bench
 from makebreak.benchmarks import plants
 from makebreak.benchmarks.plants import diagram_of
+from makebreak.diagrams.ball_rolling_config import BallRollingConfig
+from makebreak.diagrams.ball_rolling_config import (
+    parameter_learner_config as rolling_learner_config,
+)
 from makebreak.diagrams.push_object_config import (
     STEADY,
     PushParametersConfig,
@@ -31,9 +35,12 @@ from makebreak.systems.contact_mpc.numerics.ball_state import (
     N_X,
     P_BALL,
     P_TIP,
+    Q_BALL,
     V_BALL,
     V_TIP,
     W_BALL,
+    pack,
+    rolling_velocity,
 )
 from makebreak.systems.contact_mpc.numerics.lcs import LCS, simulate
 from makebreak.systems.contact_mpc.numerics.parameter_posterior import (
@@ -52,6 +59,7 @@ from makebreak.systems.contact_mpc.numerics.parameter_posterior import (
     nearest,
     prior,
     root_of,
+    scatter,
     step_of,
     updated,
 )
@@ -59,7 +67,9 @@ from makebreak.systems.contact_mpc.parameter_learner import (
     ParameterLearner,
     ParameterLearnerConfig,
     ParameterStatus,
+    _noise_of,
 )
+from makebreak.systems.perception.numerics.pose_filter import turned
 
 DOOR, DRAWER, LEG, BOX = bench.DOOR, bench.DRAWER, bench.LEG, bench.BOX
 MORE = {  # Further parameters of the plants.
@@ -310,12 +320,13 @@ def test_a_damping_takes_what_was_moved_whatever_the_speed_was_meanwhile():
 
 
 def test_an_impact_is_where_bodies_meet_and_not_where_they_move_together():
-    lcs, M = sliding(1.0), np.eye(1)
+    lcs, M, here = sliding(1.0), np.eye(1), np.ones(1, bool)
     for dv, part in ((np.array([-0.5]), 1.0), (np.zeros(1), 0.0)):
         x_next = np.array([0.0, 0.5 + dv[0]])
         sample = Sample(np.array([0.0, 0.5]), np.zeros(1), x_next, dv, M)
         lacks = np.array([0.0, 0.5])  # A force has changed the speed by so much.
-        assert impact_part(lcs, sample, lacks) == pytest.approx(part)
+        assert impact_part(lcs, sample, lacks, ~here) == pytest.approx(part)
+        assert impact_part(lcs, sample, lacks, here) == 0.0  # Nor in the air.
 
 
 @pytest.mark.parametrize("task", [DOOR, LEG], ids=lambda t: t.name)
@@ -378,13 +389,13 @@ def test_errors_in_parts_of_the_change_weigh_less_and_as_the_mass_matrix_says():
     M = np.array([[2.0, 0.3], [0.3, 1.0]])
     Q = np.array([0.0, 0.0, 1e4, 1e4])
     lacks = np.array([0.0, 0.0, 0.5, -1.0])
-    W, _ = error_weights(Q, 0.1, lacks, M)
+    W, _ = error_weights(Q, scatter(0.1, lacks, M))
     size = 0.01 * lacks[2:] @ M @ lacks[2:] / 2.0
     expected = np.linalg.inv(np.diag(1.0 / Q[2:]) + size * np.linalg.inv(M))
     np.testing.assert_allclose(W[2:, 2:], expected, rtol=1e-9)
     assert not W[:2].any()
     np.testing.assert_allclose(root_of(W).T @ root_of(W), W, atol=1e-9 * W.max())
-    np.testing.assert_array_equal(error_weights(Q, 0.1, np.zeros(4), M)[0], np.diag(Q))
+    np.testing.assert_array_equal(error_weights(Q, np.zeros((2, 2)))[0], np.diag(Q))
 
 
 def test_scale_and_its_slopes():
@@ -635,7 +646,7 @@ def test_a_step_that_refutes_the_model_most_counts():
         x_next, _ = simulate(true, x, u)
         sample = Sample(x, u, x_next, *model.between(x, x_next))
         wrong = model.build(sample.x, u)
-        loss, _ = learner._loss_of(prior(3), sample, lambda z, lcs=wrong: lcs)
+        loss, *_ = learner._loss_of(prior(3), sample, lambda z, lcs=wrong: lcs)
         if explain(wrong, sample, loss).loss > 10.0:
             refuting += 1
             belief, _ = learner._learned(prior(3), sample)
@@ -659,10 +670,10 @@ def test_noise_is_as_large_as_what_the_forces_leave_free(speed, slip_noise):
         between = model.between(sample.x_now, x_next)
         step = Sample(sample.x_now, sample.u, x_next, *between)
         lcs = model.build(step.x, step.u)
-        loss, _ = learner._loss_of(prior(2), step, lambda z, lcs=lcs: lcs)
+        loss, *_ = learner._loss_of(prior(2), step, lambda z, lcs=lcs: lcs)
         found = explain(lcs, step, loss)
         losses.append(2.0 * found.loss)
-        limits.append(learner._noise_of(found))
+        limits.append(_noise_of(found, loss))
     # n + 2 sqrt(2 n) of n degrees is passed by 5 % of a chi-square.
     assert 0.02 < np.mean(np.array(losses) > limits) < 0.1
     n = (np.sqrt(2.0 + np.array(limits)) - np.sqrt(2.0)) ** 2
@@ -733,7 +744,7 @@ def test_where_a_surface_is_turns_the_normal_of_a_corner(axes, place, gap_std, t
     u = np.zeros(len(axes))
     u[:2] = -f * way  # What the wall holds.
     sample = Sample(x, u, x, sample.v_mean, sample.M)
-    loss, _ = learner._loss_of(prior(len(items)), sample, lambda z: lcs)
+    loss, *_ = learner._loss_of(prior(len(items)), sample, lambda z: lcs)
     W = loss.W[len(x) // 2 :, len(x) // 2 :]
     expected = np.linalg.inv(np.eye(len(axes)) * 1e-4 + np.outer(change, change))
     np.testing.assert_allclose(W, expected, rtol=0.05, atol=100.0)
@@ -931,6 +942,39 @@ def test_noise_of_velocities_is_no_friction(seed):
     assert values[0] == pytest.approx(2.0, rel=0.15)
 
 
+@pytest.mark.parametrize(("speed", "rolls"), [(0.1, True), (0.01, False)])
+def test_a_ball_that_coasts_tells_what_resists_it_whatever_the_tip_does(speed, rolls):
+    """Steps of a ball that loses (5/7) g lever / R, below a tip that an unknown force
+    jerks by 0.3 m/s. One that is no faster than noise may rest: it tells nothing."""
+    lever, R, dt = 5e-4, 0.0315, 0.05
+    pairs = [ContactPair("tip::tip", "ball::ball"), ContactPair("ball::ball", "table")]
+    pairs[1] = replace(pairs[1], b="table::table")
+    items = [Parameter("rolling", 3e-4, pairs=[1]), Parameter("gap", 5e-3, pairs=[0])]
+    settings = rolling_learner_config(BallRollingConfig(), R, pairs, items)
+    model = make_tip_and_ball(TipAndBall())[0]
+    learner, belief = ParameterLearner(model, settings, dt), prior(2)
+    way = np.array([0.6, -0.8])
+
+    def state(t):
+        v, ball = speed - 5 / 7 * 9.81 * lever / R * t, np.zeros(3)
+        ball[:2] = 0.5 * (speed + v) * t * way
+        tip = np.array([0.0, 0.0, 2.0 * R + 0.1])
+        x = pack(tip, [0.0, 0.3 * t / dt, 0.0], ball + [0, 0, R], [*v * way, 0], R)
+        x[Q_BALL] = turned(x[Q_BALL], rolling_velocity(ball, R))
+        return x
+
+    now, after = state(0.0), state(dt)
+    sample = Sample(now, np.zeros(3), after, *learner.model.between(now, after))
+    for _ in range(30):
+        belief, _ = learner._learned(belief, sample)
+    std = belief.std[0] * 3e-4
+    assert (std < 1.5e-4) == rolls and belief.std[1] == pytest.approx(1.0)
+    if rolls:
+        assert belief.mean[0] * 3e-4 == pytest.approx(lever, abs=2.0 * std)
+    else:
+        assert belief.mean[0] == 0.0 and std == pytest.approx(3e-4)
+
+
 def test_what_sticks_tells_of_friction_only_beyond_the_noise():
     """A velocity of weight 1, without contact, is the parameter, but for 1 or 3."""
     lcs, loss = sliding(1.0), Loss(np.diag([0.0, 1.0]), 1.0, 1e-4)
@@ -965,7 +1009,7 @@ def test_what_sticks_tells_of_no_friction_where_the_explanation_lifts_the_object
     for one that is rougher."""
     learner, sample = pushed_box(0.0, excess=1.5)
     lcs = learner.model.build(sample.x, sample.u)
-    loss, slides = learner._loss_of(prior(2), sample, lambda z: lcs)
+    loss, slides, _ = learner._loss_of(prior(2), sample, lambda z: lcs)
     found = explain(lcs, sample, loss)
     values, rough = learner._scale.values(np.zeros(2)), np.array([0.4, 1.1 * BOX_MU])
     dx, dw = learner.model.step_changes(sample.x, sample.u, lcs, found.lam, values)
@@ -1119,7 +1163,7 @@ def test_many_states_get_the_values_of_parameters_too(chooses):
 def test_a_wrong_friction_is_no_gap_and_no_mass():
     learned = bench.run(DOOR, DOOR.values | {"friction": 0.8}, False, True)
     mass, damping, friction, gap = learned.values
-    assert friction == pytest.approx(0.8, rel=0.2) and (abs(learned.off) < 1.645).all()
+    assert friction == pytest.approx(0.8, rel=0.15) and (abs(learned.off) < 1.645).all()
     assert mass == pytest.approx(2.0, rel=0.15) and abs(gap) < 1e-3
 
 

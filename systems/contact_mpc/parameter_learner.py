@@ -33,6 +33,7 @@ from makebreak.systems.contact_mpc.numerics.parameter_posterior import (
     normals,
     prior,
     pushes,
+    scatter,
     tangent_edges,
     tangents,
     updated,
@@ -43,6 +44,7 @@ from makebreak.systems.numerics.timing import timed
 
 DIFFERENCE = 1e-6  # Of a parameter of pairs, for its derivatives.
 NINETY = 1.645  # Deviations of a 90 % interval.
+SURELY = 4.0  # Deviations: a model may well be wrong by two or three.
 # Least number of friction directions of a contact, but in a plane. A friction cone of
 # two holds a force between its edges that is up to 29 %, on average 10 %, less than the
 # largest, and friction would be learned as that much larger; four: 8 %, on average 3 %.
@@ -162,6 +164,8 @@ class ParameterLearner(LeafSystem):
             )
         gamma = min(m.eps_c, 0.5 * gamma_bound(m.at_default().F))
         self._Q_d = Q_d
+        # A step has the noise of both its ends.
+        self._noise = 0.5 / np.maximum(Q_d[m.n_q :], 1e-12)
         # The loss has |gap speed|^2 / (2 eps gamma) of a closed contact.
         self._loss = Loss(np.diag(Q_d), c.contact_std**2 / gamma, gamma)
         self._scale = Scale(
@@ -287,11 +291,11 @@ class ParameterLearner(LeafSystem):
                 both = changes_by(lcs, build_of(other), sample, lam)
                 dx[:, i], dw[:, i] = both[0] / DIFFERENCE, both[1] / DIFFERENCE
             one_sided = model.sticks(lcs, slides)
-            slopes = scale.slopes(values)
+            slopes = np.where(rests, 0.0, scale.slopes(values))
             return dx * slopes, dw * slopes, one_sided
 
         try:
-            loss, slides = self._loss_of(belief, sample, build)
+            loss, slides, rests = self._loss_of(belief, sample, build)
         except (ValueError, RuntimeError):  # No LCS about these states.
             return belief, None
         starts = self._touching(belief, sample, build)
@@ -299,7 +303,7 @@ class ParameterLearner(LeafSystem):
         after, found = updated(belief, sample, loss, c.trust, build, changes, starts)
         # What no value explains within the noise is something that the model lacks, or
         # a gap is believed that is none: of ground that gave way where a foot landed.
-        if found is not None and 2.0 * found.loss > self._noise_of(found):
+        if found is not None and 2.0 * found.loss > _noise_of(found, loss):
             room = BEYOND_NOISE**2 * self._constant - belief.std**2
             doubted = np.clip(room, 0.0, self._constant)
             return less_certain(belief, doubted * self._pushing(found, sample)), found
@@ -326,23 +330,22 @@ class ParameterLearner(LeafSystem):
                 starts.append(start)
         return starts
 
-    def _noise_of(self, found: Explained) -> float:
-        """The most that twice a step's loss may be by noise: of a chi-square of as many
-        degrees as what is weighed has more than the forces that are free."""
-        rows = self._Q_d > 0.0
-        forces = np.linalg.matrix_rank(found.D[np.ix_(rows, found.f > 0.0)])
-        n = np.count_nonzero(rows) - forces
-        return n + BEYOND_NOISE * np.sqrt(2.0 * n)
-
-    def _loss_of(self, belief: Belief, sample: Sample, build) -> tuple[Loss, Any]:
-        """The step's loss, by what slides and what the forces under the belief do; and
-        which of the LCS's rows slide, (n_lam,) bool."""
+    def _loss_of(self, belief: Belief, sample: Sample, build) -> tuple[Loss, Any, Any]:
+        """The step's loss, by what slides and what the forces under the belief do;
+        which of the LCS's rows slide, (n_lam,) bool; and of which parameters nothing is
+        told, as a pair that resists rolling may rest, (n,) bool."""
         c, model = self._config, self.model
         lcs = build(belief.mean)
         values = self._scale.values(belief.mean)
         friction = model.parameters.of_pairs("friction", values, self._friction)
         friction, high = (model.of_rows(lcs, of) for of in (friction, self._high))
-        acts = acting(lcs, sample, friction, c.slip_noise, high)
+        # A contact that is apart for all that is known of its gap has no force.
+        unsure = model.parameters.of_pairs(
+            "gap", self._scale.std * belief.std, np.zeros(model.n_pairs)
+        )
+        unsure = np.hypot(c.contact_std, model.of_rows(lcs, unsure) / model.dt_sec)
+        apart = nearest(lcs, sample) > SURELY * unsure
+        acts = acting(lcs, sample, friction, c.slip_noise, high, None, apart)
         loss = replace(self._loss, acting=acts)
         lacks = lacks_of(lcs, sample)
         further = model.parameters.unknown_at_rest(
@@ -350,10 +353,13 @@ class ParameterLearner(LeafSystem):
             sample.x_now[-model.n_v :], sample.x_next[-model.n_v :],
             sample.M, model.dt_sec,
         )  # fmt: skip
-        found = explain(lcs, sample, loss)
+        found, of_normals = explain(lcs, sample, loss), np.zeros_like(lacks)
+        rests = np.zeros(len(values), bool)
         if found is not None and found.lam.any():
             if np.any(high != 1.0):  # Else no force tilts a normal.
-                acts = acting(lcs, sample, friction, c.slip_noise, high, found.lam)
+                acts = acting(
+                    lcs, sample, friction, c.slip_noise, high, found.lam, apart
+                )
                 loss = replace(loss, acting=acts)
                 found = explain(lcs, sample, loss) or found
             # Forces may act at the step's end instead of its beginning.
@@ -368,10 +374,26 @@ class ParameterLearner(LeafSystem):
             for errors in acts.errors:
                 astray = (lcs.D @ (errors * found.f))[-model.n_v :]
                 further += astray @ astray.T
-        impacts = c.impact_share**2 * impact_part(lcs, sample, lacks)
-        share = np.sqrt(c.error_share**2 + impacts)
-        W, of_model = error_weights(self._Q_d, share, lacks, sample.M, further)
-        return replace(loss, W=W, of_model=of_model), acts.slides
+            std = self._scale.slopes(values) * belief.std
+            unknown, rests = model.unknown_rolling(
+                sample, lcs, found.lam, np.hypot(values, std), self._noise
+            )
+            further += unknown
+            # A normal force errs along itself alone: where a surface is, is above.
+            by = (normals(lcs) * found.lam[:, None]).sum(axis=0)
+            of_normals[-model.n_v :] = model.dt_sec * np.linalg.solve(sample.M, by)
+        lam = np.zeros(lcs.n_lam) if found is None else found.lam
+        # What only a contact that is apart could have changed tells of nothing, however
+        # wrong it is: an arm that swings back from what it has pushed.
+        dx, _ = model.step_changes(sample.x, sample.u, lcs, lam, values)
+        told = (lcs.D @ acts.ways).any(axis=1) | dx.any(axis=1)
+        alone = lcs.D[:, apart].any(axis=1) & ~told
+        lacks, of_normals = np.where(alone, 0.0, [lacks, of_normals])
+        further += scatter(c.error_share, lacks + of_normals, sample.M)
+        impacts = c.impact_share * np.sqrt(impact_part(lcs, sample, lacks, apart))
+        further += scatter(impacts, lacks, sample.M)
+        W, of_model = error_weights(np.where(alone, 0.0, self._Q_d), further)
+        return replace(loss, W=W, of_model=of_model), acts.slides, rests
 
     def _elsewhere(self, sample: Sample, lcs, friction, high, lam) -> np.ndarray:
         """(n_v, n_v) covariance of a step's velocities from where contacts are: a
@@ -394,6 +416,15 @@ class ParameterLearner(LeafSystem):
                 change = model.dt_sec * np.linalg.solve(sample.M, change)
                 found += 0.5 * np.outer(change, change)
         return found
+
+
+def _noise_of(found: Explained, loss: Loss) -> float:
+    """The most that twice a step's loss may be by noise: of a chi-square of as many
+    degrees as what is weighed has more than the forces that are free."""
+    rows = np.diag(loss.W) > 0.0
+    forces = np.linalg.matrix_rank(found.D[np.ix_(rows, found.f > 0.0)])
+    n = np.count_nonzero(rows) - forces
+    return n + BEYOND_NOISE * np.sqrt(2.0 * n)
 
 
 def _finer(pair: ContactPair) -> ContactPair:

@@ -242,6 +242,43 @@ class AnitescuLcs:
         parts = np.where(planar, parts[..., ::-1] * [1.0, -1.0], parts)
         return parts[:, layout.rows.contact]
 
+    def unknown_rolling(self, sample, lcs: LCS, lam, most, variance):
+        """What is not known of a step, as pairs may rest in it that resist rolling.
+
+        A pair rests if it rolls at either end of the step within two deviations of
+        none, or of what the resistance stops; its torque may be any up to that.
+
+        Args: sample: of the step, with which lcs was built; lam (n_lam,) [N]; most
+            (n,): of the parameters, the largest that is believed; variance (n_v,) of
+            the measured velocities.
+        Returns: (n_v, n_v) covariance of the change of velocity, and (n,) whether a
+            parameter is the resistance of pairs of which one rests.
+        """
+        p, n_v, dt = self.parameters, self.n_v, self.dt_sec
+        covariance, resting = np.zeros((n_v, n_v)), set()
+        if not p.has("rolling"):
+            return covariance, np.zeros(len(p), bool)
+        lever = p.of_pairs("rolling", most, np.zeros(self.n_pairs))
+        lever, contact = self.of_rows(lcs, lever), np.asarray(lcs.contact, dtype=int)
+        pair = self.of_rows(lcs, np.arange(self.n_pairs))
+        self._plant.SetPositions(self._plant_context, sample.x[: self.n_q])
+        for one in np.unique(contact[lever > 0.0]):
+            mine = contact == one
+            J = self._points.rolling(self._plant_context, one)
+            torque = lever[mine][0] * lam[mine].sum() * J
+            change = dt * np.linalg.solve(sample.M, torque.T)
+            now, after = J @ sample.x_now[-n_v:], J @ sample.x_next[-n_v:]
+            along = now + after
+            along = along / max(np.linalg.norm(along), 1e-300)
+            noise = (J**2 @ variance).max()
+            stopped = np.linalg.norm(J @ change, 2)
+            if min(now @ along, after @ along) <= 2.0 * np.sqrt(noise) + stopped:
+                covariance += change @ change.T
+                resting.add(pair[mine][0])
+        return covariance, np.array([
+            p.kind == "rolling" and bool(resting & set(p.pairs)) for p in p.items
+        ])  # fmt: skip
+
     def step_changes(self, x, u, lcs: LCS, lam, parameters):
         """How a step changes with the parameters of bodies and joints, at the forces
         lam (n_lam,) [N].

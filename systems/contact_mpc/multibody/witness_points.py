@@ -105,21 +105,11 @@ class WitnessPoints:
         bodies' relative angular velocity. It fades where a weight of what the normal
         J_n (n_contacts, n_v) moves would stop the rolling in a step of dt [s].
         """
-        plant, layout, world = self._plant, self._layout, self._plant.world_frame()
-        query: Any = self._query_port.Eval(context)
-        v, out = plant.GetVelocities(context), np.zeros((len(chosen), len(M)))
+        v, out = self._plant.GetVelocities(context), np.zeros((len(chosen), len(M)))
         for k, i in enumerate(chosen):
             if lever[k] == 0.0:
                 continue
-            id_A, id_B = layout.geometries[i]
-            n = self.distance(query, id_A, id_B)[1]
-            J_A, J_B = (
-                plant.CalcJacobianAngularVelocity(
-                    context, JacobianWrtVariable.kV, self.frames[of][0], world, world
-                )
-                for of in (id_A, id_B)
-            )
-            J = (np.eye(3) - np.outer(n, n)) @ (J_A - J_B)
+            J = self.rolling(context, i)
             rate = J @ v
             speed = np.linalg.norm(rate)
             along = rate / speed if speed > 0.0 else np.zeros(3)
@@ -128,6 +118,20 @@ class WitnessPoints:
             stopped = dt * abs(lever[k]) * GRAVITY * mobility / moved
             out[k] = lever[k] * min(speed / max(stopped, 1e-300), 1.0) * (along @ J)
         return out
+
+    def rolling(self, context: Context, i: int) -> np.ndarray:
+        """(3, n_v) Jacobian of how the bodies of a contact roll on each other."""
+        plant, world = self._plant, self._plant.world_frame()
+        query: Any = self._query_port.Eval(context)
+        id_A, id_B = self._layout.geometries[i]
+        n = self.distance(query, id_A, id_B)[1]
+        J_A, J_B = (
+            plant.CalcJacobianAngularVelocity(
+                context, JacobianWrtVariable.kV, self.frames[of][0], world, world
+            )
+            for of in (id_A, id_B)
+        )
+        return (np.eye(3) - np.outer(n, n)) @ (J_A - J_B)
 
     def _distances(self, context: Context):
         """distance() of all contacts. Where two geometries just touch, Drake's normal

@@ -158,7 +158,7 @@ class Explained:
 
 
 def acting(
-    lcs: LCS, sample: Sample, friction, noise: float, high=None, lam=None
+    lcs: LCS, sample: Sample, friction, noise: float, high=None, lam=None, open_=None
 ) -> Acting:
     """What the contacts' forces can be, by how they are seen to slide.
 
@@ -172,14 +172,15 @@ def acting(
         Where it is not 1 the cone's first axis stands for forces that no slip tells:
         any of them may act, and the contact slides if it does across that axis. They
         are those of a normal that is tilted, so the friction is that of both together:
-        lam (n_lam,) says how large they are; None: none.
+        lam (n_lam,) says how large they are; None: none. open_ (n_lam,) bool: rows of
+        contacts that no force can have; None: none.
     """
     J, _, contact = pushes(lcs)
     along = J - normals(lcs)
     n_v, n = sample.v_mean.size, len(J)
     v_ends = np.stack([sample.x_now[-n_v:], sample.x_next[-n_v:]])
     parts, slides = [np.zeros((4, n, 0))], np.zeros(n, bool)
-    for one in np.unique(contact):
+    for one in np.unique(contact if open_ is None else contact[~open_]):
         mine = contact == one
         k, ratio = int(mine.sum()), 1.0 if high is None else high[mine][0]
         (_, axes), tilted = _edges(k), 1.0
@@ -235,19 +236,23 @@ def step_of(lcs: LCS, sample: Sample):
     return lacks, nearest(lcs, sample) + pushes(lcs)[0] @ lacks[-n_v:]
 
 
-def error_weights(Q_d, share, lacks, M, further=0.0) -> tuple[np.ndarray, np.ndarray]:
+def scatter(share, change, M) -> np.ndarray:
+    """(n_v, n_v) covariance of velocities: in any direction, in parts `share` of the
+    size of `change` (n_x,), as the mass matrix M (n_v, n_v) measures it."""
+    n_v = len(M)
+    size = share**2 * (change[-n_v:] @ M @ change[-n_v:]) / n_v
+    return size * np.linalg.inv(M)
+
+
+def error_weights(Q_d, more) -> tuple[np.ndarray, np.ndarray]:
     """(n_x, n_x) inverse covariance of a step's errors, and (n_v, n_v) what part of an
     error of the velocities is the model's.
 
-    Args: Q_d (n_x,) inverse variances that do not depend on the step; lacks (n_x,): the
-        measured change that is not that of free motion; share: further error in parts
-        of the size of `lacks`, as the mass matrix M (n_v, n_v) measures it, in any
-        direction; further: (n_v, n_v) covariance of the velocities' other errors.
+    Args: Q_d (n_x,) inverse variances that do not depend on the step; more (n_v, n_v):
+        covariance of the velocities' other errors.
     """
-    n_v = len(M)
+    n_v = len(more)
     W = np.diag(np.asarray(Q_d, dtype=float))
-    size = share**2 * (lacks[-n_v:] @ M @ lacks[-n_v:]) / n_v
-    more = size * np.linalg.inv(M) + further
     Q, of_sensors = W[-n_v:, -n_v:], np.eye(n_v)
     if more.any():  # (1 / Q + more)^-1, as Q may be zero.
         of_sensors = np.linalg.inv(of_sensors + more @ Q)
@@ -261,12 +266,16 @@ def root_of(W) -> np.ndarray:
     return np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
 
 
-def impact_part(lcs: LCS, sample: Sample, lacks) -> float:
+def impact_part(lcs: LCS, sample: Sample, lacks, apart) -> float:
     """Part, 0 to 1, of the energy of the change `lacks` (n_x,) that is of contacts
-    whose bodies meet or part in the step: nothing while they move together."""
+    whose bodies meet or part in the step: nothing while they move together, or where
+    they are apart, (n_lam,) bool of the rows. (What explains the step without a force
+    of the others may be wrong.)"""
     n_v = sample.v_mean.size
     dv, energy = (sample.x_next - sample.x_now)[-n_v:], 0.0
-    for normal in normals(lcs)[np.unique(pushes(lcs)[2], return_index=True)[1]]:
+    contact, of_rows = pushes(lcs)[2], normals(lcs)
+    for one in np.unique(contact[~apart]):
+        normal = of_rows[contact == one][0]
         if normal.any():
             mobility = normal @ np.linalg.solve(sample.M, normal)
             if mobility > 0.0:
@@ -345,6 +354,9 @@ def explain(lcs: LCS, sample: Sample, loss: Loss) -> Explained | None:
     F += loss.gamma * (np.eye(len(q)) - own.rows.T @ own.ways)
     if not all(np.isfinite(of_qp).all() for of_qp in (P, p, F, q)):
         return None
+    if not len(q):  # No contact.
+        total = float(0.5 * z @ loss.W @ z)
+        return Explained(lcs, total, np.zeros(lcs.n_lam), own, q, q, q, D, F)
     F += np.eye(len(q)) * max(loss.gamma - 0.5 * gamma_bound(F + 0.5 * P), 0.0)
     solved, cost, f, eta, force = solve_step(P, p, F, q, loss.gamma)
     total = float(0.5 * z @ loss.W @ z + cost / loss.eps)
