@@ -257,10 +257,11 @@ def _together(one: Alone, result: GapResult):
         fit = fit_effects(one.problem, one.selection.screen(one.problem), start)
     except (ValueError, RuntimeError):  # A scene cannot have them.
         return {}
+    sizes = one.problem.sizes
     return {
         _key(e): {n: (e.parameters[n], s) for n, s in std.items()}
         for e, std in zip(fit.effects, fit.std, strict=True)
-        if is_sane(e, one.problem.least(e.kind, e.at))
+        if is_sane(e, sizes, one.problem.least(e.kind, e.at))
     }
 
 
@@ -275,7 +276,8 @@ def _beside(one: Alone, effect: Effect) -> dict[str, tuple[float, float]]:
         fit = fit_effects(one.problem, one.selection.screen(one.problem), start, fixed)
     except (ValueError, RuntimeError):  # A scene cannot have it there.
         return {}
-    if not is_sane(fit.effects[-1], one.problem.least(effect.kind, effect.at)):
+    least = one.problem.least(effect.kind, effect.at)
+    if not is_sane(fit.effects[-1], one.problem.sizes, least):
         return {}  # It says nothing here.
     value, std = fit.effects[-1].parameters, fit.std[-1]
     return {n: (value[n], std[n]) for n in free if n in std}

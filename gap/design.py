@@ -29,6 +29,7 @@ from makebreak.models.effects.kind import (
     unit_at,
 )
 from makebreak.models.effects.signature import Motion
+from makebreak.models.effects.sizes import range_of
 from makebreak.models.model_files import couplings_of, robot_files
 from makebreak.models.scene import Scene
 from makebreak.models.typed_yaml import nearest
@@ -180,7 +181,9 @@ class LogDesign:
             known = {p.name: p for p in KINDS[kind].parameters}
             for name in self.dynamics.signatures(kind, [at], motion)[0].unknowns:
                 p = known.get(name)
-                size = np.inf if p is None else 0.5 * (p.high - p.low)
+                size = np.inf
+                if p is not None:
+                    size = 0.5 * float(np.ptp(range_of(p, [at], self.dynamics.sizes)))
                 if kind in LINKS and p is not None and p.unit == "kg":
                     size = masses[at]
                 if (kind, at) not in self.named:

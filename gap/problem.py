@@ -18,6 +18,7 @@ from makebreak.gap.thresholds import NESTED_GAIN, UNEXPLAINED_RMS, UNEXPLAINED_S
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, check_parameters
+from makebreak.models.effects.sizes import Sizes, range_of
 from makebreak.models.scene import Scene
 
 DISTANCES = "distances"  # A channel is judged by these alone: not its motion.
@@ -117,10 +118,10 @@ class Candidate:
             first += k
         return tuple(found)
 
-    def is_sane(self, effects: Sequence[Effect]) -> bool:
+    def is_sane(self, effects: Sequence[Effect], sizes: Sizes | None) -> bool:
         """Whether effects of it are allowed, and of a size that robots have."""
-        each = self.members or (self,)
-        return all(is_sane(e, c.least) for e, c in zip(effects, each, strict=True))
+        each = zip(effects, self.members or (self,), strict=True)
+        return all(is_sane(e, sizes, c.least) for e, c in each)
 
     def fixed_of_each(self) -> tuple[tuple[str, ...], ...]:
         """Of each effect, the parameters that a fit leaves as they are."""
@@ -132,10 +133,13 @@ def rms(x: np.ndarray) -> float:
     return float(np.sqrt(np.mean(x**2))) if len(x) else 0.0
 
 
-def is_sane(effect: Effect, least: Mapping[str, float] | None = None) -> bool:
+def is_sane(
+    effect: Effect, sizes: Sizes | None, least: Mapping[str, float] | None = None
+) -> bool:
     """Whether the parameters are allowed, and of a size that robots have.
 
-    Args: least, what the model allows (SceneDynamics.least).
+    Args: sizes: of the scene, without which those that go with them may be any; least:
+        what the model allows (SceneDynamics.least).
     """
     entry = KINDS[effect.kind]
     try:
@@ -148,8 +152,9 @@ def is_sane(effect: Effect, least: Mapping[str, float] | None = None) -> bool:
             continue
         if value < (least or {}).get(each.name, -np.inf):
             return False
-        width = each.high - each.low
-        if not each.low - 0.01 * width <= value <= each.high + 0.01 * width:
+        low, high = range_of(each, effect.at, sizes)
+        width = high - low
+        if not low - 0.01 * width <= value <= high + 0.01 * width:
             return False
     return entry.plausible is None or entry.plausible(effect)
 
@@ -230,6 +235,11 @@ class GapProblem(ABC):
     by_equations: bool = True
     # Root of how many neighbouring rows say the same: their errors go together.
     correlation: float = 1.0
+
+    @property
+    def sizes(self) -> Sizes | None:
+        """How large the scene is; None: not known, and no range goes with it."""
+        return self.dynamics.sizes
 
     @abstractmethod
     def residual(self, effects: Sequence[Effect] = ()) -> np.ndarray:

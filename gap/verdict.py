@@ -33,6 +33,7 @@ from makebreak.models.effects.kind import (
     sliding_joints,
     unit_at,
 )
+from makebreak.models.effects.sizes import range_of, sizes_of
 
 OF_CHANNEL = "(unit of the channel)"
 
@@ -292,13 +293,16 @@ def named(choice: Choice, plant: MultibodyPlant, beside: str = "") -> NamedEffec
         joint, quantity = place.rsplit(".", 1)
         own_unit = unit_of(quantity, joint in sliding_joints(plant))
     parameters, std = {}, {}
+    go_with_size = any(p.of_size for p in kind.parameters)
+    sizes = sizes_of(plant) if go_with_size else None
     weak = False
     for each in kind.parameters:
         if each.name not in choice.effect.parameters:
             continue
         value = choice.effect.parameters[each.name]
         spread = choice.std.get(each.name, 0.0)
-        width = each.high - each.low
+        low, high = range_of(each, choice.effect.at, sizes)
+        width = high - low
         if not spread < width:  # The data say nothing of it.
             spread = float("inf")
         weak |= spread > max(abs(value), 1e-3 * width)

@@ -231,8 +231,7 @@ def _run(
     seconds["checks"] = clock.lap()
     limbs = limbs_of(dynamics, parts.decided) if is_mechanism and not meets else []
     if limbs:
-        say("asking when measured efforts act")
-        parts, found = _with_efforts_of_loops(scene, parts, limbs, jobs)
+        parts, found = _with_efforts_of_loops(scene, parts, limbs, jobs, say)
         checks += found
     if len(limbs) > 1 and any(r.commands() for r in parts.decided):
         scene, parts, found = _with_commands_of_most(scene, parts, limbs, jobs)
@@ -258,12 +257,18 @@ def _run(
         return replace(result, unfinished=tuple(own.undone))
 
     results: list[GapResult] = []
+
+    def say_how_many() -> None:  # What copies of this process say is not heard.
+        say(f"comparing limbs, {len(results)} of {len(limbs)} done")
+
     with budget.part(LIMBS):
+        say_how_many()
         try:
             for one in side_by_side(
                 [partial(of_limb, k) for k in range(len(limbs))], jobs
             ):
                 results.append(one)
+                say_how_many()
         except Stopped:
             for limb in limbs[len(results) :]:
                 budget.leave(f"comparing {limb[0]} and on")
@@ -433,14 +438,16 @@ def _conditioned(
 
 
 def _with_efforts_of_loops(
-    scene: Scene, parts: Split, limbs: Sequence[Sequence[str]], jobs: int
-) -> tuple[Split, list[Finding]]:
+    scene: Scene, parts: Split, limbs: Sequence[Sequence[str]], jobs: int,
+    say: Callable[[str], None],
+) -> tuple[Split, list[Finding]]:  # fmt: skip
     """The recordings with measured efforts that act between their rows as their loops
     had them, and what was found: one number for all limbs, where the few effects that
     explain their motion cost less with it beyond doubt."""
     every = [c for r in parts.decided for c in r.channels.values()]
     if not any(c.noise_from == OF_LOOP for c in every):
         return parts, []
+    say("asking when measured efforts act")
     ways = [partial(of_loops, share=share) for share in SHARES]
 
     def gained(limb: Sequence[str]) -> np.ndarray:
@@ -925,7 +932,7 @@ def _best_of_all(problem: GapProblem, selection: Selection) -> list[Tried]:
     """The best candidate where none was good enough to be chosen."""
     for each in selection.table[:1]:
         effect = Effect(each.kind, list(each.at), dict(each.parameters))
-        if not each.score < 1.0 or not is_sane(effect):
+        if not each.score < 1.0 or not is_sane(effect, problem.sizes):
             break
         choice = Choice(effect, {}, 1.0, each.score, "", 0.0, (), (), 1)
         why = (

@@ -35,6 +35,7 @@ from makebreak.models.effects.kind import (
     one_dof_joints,
 )
 from makebreak.models.effects.signature import Grid, Motion, Signature
+from makebreak.models.effects.sizes import sizes_of
 from makebreak.models.joint_tree import (
     NoJointTree,
     carrier,
@@ -80,6 +81,7 @@ class SceneDynamics:
             replace(scene, effects=measured), DiagramBuilder()
         )
         self.plant: MultibodyPlant = self.loaded.plant
+        self.sizes = sizes_of(self.plant)
         self.gravity = np.array(self.plant.gravity_field().gravity_vector())
         self._context = self.plant.CreateDefaultContext()
         self._forces = MultibodyForces(self.plant)

@@ -290,7 +290,7 @@ def test_a_spring_pulls(tmp_path):
     )
     for stiffness, sane in ((0.2, True), (-0.2, False)):
         effect = Effect("joint_spring", ["p.j1"], {"stiffness": stiffness, "rest": 0.1})
-        assert candidate.is_sane([effect]) == sane
+        assert candidate.is_sane([effect], None) == sane
 
 
 def test_of_dry_friction_acts_what_a_motion_says(tmp_path):

@@ -70,6 +70,7 @@ class Bends(GapProblem):
 
     plan = SearchPlan(jumps=True, least_gain=0.05, counts_evidence=True)
     by_equations = False
+    sizes = None
     dynamics = SimpleNamespace(
         now=lambda kind, at: {"damping": 0.0}, least=lambda kind, at: {}
     )

@@ -27,10 +27,12 @@ from gap_benchmark.mechanism_world import (  # noqa: E402
     Sampling,
 )
 from gap_benchmark.robots import ROBOTS  # noqa: E402
+from gap_benchmark.robots import to_urdf as urdf_of  # noqa: E402
 from pydrake.common.eigen_geometry import Quaternion  # noqa: E402
 from pydrake.multibody.parsing import Parser  # noqa: E402
 from pydrake.multibody.plant import (  # noqa: E402
     AddMultibodyPlant,
+    MultibodyPlant,
     MultibodyPlantConfig,
 )
 from pydrake.systems.analysis import Simulator  # noqa: E402
@@ -40,6 +42,7 @@ from makebreak.gap.data.reading import check_against_scene, read_recording  # no
 from makebreak.gap.data.scene_facts import scene_names  # noqa: E402
 from makebreak.gap.problem import is_sane  # noqa: E402
 from makebreak.models.effects.kind import Effect  # noqa: E402
+from makebreak.models.effects.sizes import sizes_of  # noqa: E402
 from makebreak.models.scene import load_scene, read_scene  # noqa: E402
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -654,10 +657,16 @@ def test_the_hidden_effect_closes_the_gap_in_drake(case, tmp_path):
 def test_ranges_of_the_catalogue_hold_what_robots_have(sort):
     """A rotor of an arm of 30 kg is 3 to 4 kg m2 at its joint."""
     for seed in range(5):
-        for body in ROBOTS[sort](np.random.default_rng(seed), False).moving:
+        robot = ROBOTS[sort](np.random.default_rng(seed), False)
+        plant = MultibodyPlant(0.0)
+        Parser(plant).AddModelsFromString(urdf_of(robot), "urdf")
+        plant.Finalize()
+        sizes = sizes_of(plant)
+        for body in robot.moving:
+            at = [f"{robot.model}.{body.joint}"]
             for sign in (-1.0, 1.0):
                 inertia = {"inertia": sign * body.rotor}
-                assert is_sane(Effect("rotor_inertia", ["a.j"], inertia)), body.rotor
+                assert is_sane(Effect("rotor_inertia", at, inertia), sizes), body.rotor
         for coulomb in np.ravel(COULOMB[sort]):
             friction = {"coulomb": 1.6 * float(coulomb)}
-            assert is_sane(Effect("joint_coulomb_friction", ["a.j"], friction))
+            assert is_sane(Effect("joint_coulomb_friction", at, friction), sizes)

@@ -377,7 +377,8 @@ def test_simulation_decides_between_what_equations_find_alike(
 
     monkeypatch.setattr(chosen_by_simulation, "fit_effects", fit)
     problem = SimpleNamespace(
-        plan=SearchPlan(simulation_agrees=True), outcome=outcome, softer=list
+        plan=SearchPlan(simulation_agrees=True), outcome=outcome, softer=list,
+        sizes=None,
     )  # fmt: skip
     choice = Choice(chosen, {}, 5.0, 1.0, "", 0.0, (), (), 1)
     nothing = SimpleNamespace()
@@ -739,8 +740,10 @@ def test_a_loud_block_is_told_though_it_is_fitted(tmp_path):
 def test_a_patch_s_side_that_nothing_crossed_may_be_anywhere():
     """A fit leaves it where it likes: that is no reason to refuse the patch."""
     sides = {"x_min": -0.1, "x_max": 2.5, "y_min": -9.0, "y_max": 0.2}
-    assert is_sane(Effect("friction_patch", [PAIR], {"friction": 0.4} | sides))
-    assert not is_sane(Effect("friction_patch", [PAIR], {"friction": 3.0} | sides))
+    assert is_sane(Effect("friction_patch", [PAIR], {"friction": 0.4} | sides), None)
+    assert not is_sane(
+        Effect("friction_patch", [PAIR], {"friction": 3.0} | sides), None
+    )
 
 
 @pytest.mark.parametrize(

@@ -110,7 +110,7 @@ NAMES = ("coulomb", "damping", "inertia")
 
 def search_of(left, train, channel):
     problem = SimpleNamespace(
-        is_within_tolerance=lambda effect: False, by_equations=True,
+        sizes=None, is_within_tolerance=lambda effect: False, by_equations=True,
         dynamics=SimpleNamespace(now=lambda kind, at: {"kp": 10.0}), correlation=1.0,
         weighed_by=lambda effects: None,
     )  # fmt: skip

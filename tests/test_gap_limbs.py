@@ -197,9 +197,14 @@ def test_limbs_that_are_done_count_where_time_is_up(tmp_path, monkeypatch):
         raise Stopped
 
     monkeypatch.setattr(workflow, "side_by_side", until_the_second)
+    said: list[str] = []
     # In a budget of its own: what is left undone stays noted there.
     files = tmp_path / "scene.yaml", [tmp_path / "recording.csv"]
-    result = run_gap(*files, budget_min=10.0)
+    result = run_gap(*files, budget_min=10.0, progress=said.append)
+    # (Where copies of the process compare limbs, nothing else is heard meanwhile.)
+    done = [text for text in said if "limbs" in text]
+    assert done == [f"comparing limbs, {k} of 2 done" for k in range(2)]
+    assert not any("measured efforts" in text for text in said)  # It was not asked.
     assert [(e.kind, e.at) for e in result.effects] == [
         ("joint_coulomb_friction", ("r.a0",))
     ]

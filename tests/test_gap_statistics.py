@@ -602,6 +602,7 @@ def test_noise_of_a_filtered_signal_is_found_beside_a_known_one():
 class OneNuisance(GapProblem):
     """Residuals with one nuisance, whose column changes sign from row to row."""
 
+    sizes = None
     plan = SearchPlan()
 
     def __init__(self, wanted_fitted: float, wanted_held_out: float):
@@ -665,6 +666,7 @@ class TwoChannels(GapProblem):
     """Two channels of 1.5 times the noise: damping shows in both, a bias in the
     second alone. Both are linear; sizes are shares of the 1.5."""
 
+    sizes = None
     plan = SearchPlan(by_channel=True, least_gain=0.1, most_effects=3)
     dynamics = SimpleNamespace(  # type: ignore[assignment]
         least=lambda kind, at: {},
@@ -1095,7 +1097,7 @@ def test_a_patch_beside_others_is_told_by_how_far_it_may_end(
     choice = Choice(patch, at_end, 2.0, after, "", 1.0, (), (), 5)
     moved = {"friction": 1e-3} | dict.fromkeys(sides, far)
     problem = SimpleNamespace(
-        widened=lambda end, k: (moved, ()), least=lambda kind, at: {}
+        sizes=None, widened=lambda end, k: (moved, ()), least=lambda kind, at: {}
     )
     search = SimpleNamespace(problem=problem, plan=SearchPlan())
     chosen = [choice, *others * [replace(choice)]]
@@ -1116,6 +1118,7 @@ def test_a_friction_that_may_be_what_the_scene_has_is_not_named(
     dynamics = SimpleNamespace(now=lambda kind, at: {"friction": 0.388})
     problem = SimpleNamespace(
         widened=lambda end, k: ({"friction": far}, or_more),
+        sizes=None,
         dynamics=dynamics,
         least=lambda kind, at: {},
     )
@@ -1172,7 +1175,7 @@ def test_what_evidence_takes_must_show_by_the_last_weights(score, alone, named):
         counts_evidence=True, least_gain=0.05, evidence_alone=alone
     )
     search.start = SimpleNamespace(score=1.0)  # type: ignore[assignment]
-    search.problem = SimpleNamespace(least=lambda kind, at: {})  # type: ignore[assignment]
+    search.problem = SimpleNamespace(sizes=None, least=lambda kind, at: {})  # type: ignore[assignment]
     current = SimpleNamespace(score=score)
     assert _is_certain(search, [choice], current, 0) == named  # type: ignore[arg-type]
 
@@ -1537,6 +1540,7 @@ def test_how_late_poses_are_is_read_by_name():
 class Line(GapProblem):
     """Rows that are linear in two frictions, or bent; how often they are asked for."""
 
+    sizes = None
     by_equations = True
     plan = SearchPlan()
     dynamics = SimpleNamespace(now=lambda kind, at: {}, least=lambda kind, at: {})

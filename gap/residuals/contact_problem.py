@@ -203,7 +203,8 @@ class ContactProblem(ContactCandidates, GapProblem):
             for c in found
             for k, fit in enumerate(map(screen.fit, c.columns))
         ]
-        singles = [s for s in singles if all(map(is_sane, s[1]))]
+        sizes = self.sizes
+        singles = [s for s in singles if all(is_sane(e, sizes) for e in s[1])]
         for _, effects in sorted(singles, key=lambda s: s[0])[:EXACT]:
             try:
                 one = fit_effects(self, screen, effects)

@@ -9,6 +9,7 @@ the touch, from a state that is smoothed on that side alone.
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from itertools import permutations
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
@@ -24,7 +25,7 @@ from makebreak.gap.residuals.contact import PLACES
 from makebreak.gap.residuals.contact_candidates import reader_of_trial
 from makebreak.gap.residuals.mechanism import link_changes
 from makebreak.gap.residuals.objects import WindowedProblem
-from makebreak.gap.simulation.contact_shapes import ContactShapes, poses_of
+from makebreak.gap.simulation.contact_shapes import BEYOND, ContactShapes, poses_of
 from makebreak.gap.simulation.windows import Window, WindowModel, drawn, with_step
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
@@ -232,9 +233,11 @@ def positions(dynamics: SceneDynamics, recording: Recording) -> np.ndarray:
     return q
 
 
-def nearest(shapes: ContactShapes, dynamics: SceneDynamics, q) -> np.ndarray:
-    """(n,) distance of the nearest pair of a link and what is fixed."""
-    return nearest_of(shapes, dynamics, q, _with_fixed(shapes))
+def nearest(
+    shapes: ContactShapes, dynamics: SceneDynamics, q, within: float = NEAR
+) -> np.ndarray:
+    """(n,) distance of the nearest pair of a link and what is fixed; see nearest_of."""
+    return nearest_of(shapes, dynamics, q, _with_fixed(shapes), within)
 
 
 def _with_fixed(shapes: ContactShapes) -> Callable[[int, int], bool]:
@@ -247,12 +250,25 @@ def nearest_of(
     dynamics: SceneDynamics,
     q: np.ndarray,
     counts: Callable[[int, int], bool],
+    within: float = NEAR,
 ) -> np.ndarray:
-    """(n,) distance of the nearest of the pairs of bodies that count."""
-    if not len(q):
-        return np.zeros(0)
-    slots = shapes.slots(poses_of(dynamics.plant, q, shapes), np.inf, counts)
-    return np.min([s.phi for s in slots], axis=0) if slots else np.full(len(q), np.inf)
+    """(n,) distance of the nearest of the pairs of bodies that count; infinite where
+    none is nearer than `within` [m]."""
+    found = np.full(len(q), np.inf)
+    asked = any(counts(a, b) for a, b in permutations(shapes.bodies(), 2))
+    if not (asked and len(q)):
+        return found
+    poses = poses_of(dynamics.plant, q, shapes)
+    # A corner just beyond a face's edge is as far as that face's plane.
+    near = within + 2.0 * BEYOND
+    pairs, rows = shapes.close(poses, near, counts)
+    if pairs:
+        some = {body: (R[rows], p[rows]) for body, (R, p) in poses.items()}
+        slots = shapes.slots(
+            some, near, lambda a, b: counts(a, b) and frozenset((a, b)) in pairs
+        )
+        found[rows] = np.min([s.phi for s in slots], axis=0) if slots else np.inf
+    return np.where(found < within, found, np.inf)
 
 
 class ImpactWindows(WindowModel):

@@ -92,7 +92,7 @@ def presses(dynamics: SceneDynamics, recordings: Sequence[Recording]) -> bool:
     for recording in recordings:
         q = positions(dynamics, recording)
         step = max(len(q) // 4000, 1)
-        apart = nearest(shapes, dynamics, q[::step])
+        apart = nearest(shapes, dynamics, q[::step], REACH)
         inside += int((apart < MEETS).sum())
         lasting += _rows_of_lasting(apart < MEETS, recording.time[::step])
         close += int((apart < REACH).sum())

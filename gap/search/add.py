@@ -150,7 +150,7 @@ def _ranked(
     rms that the best leaves, against which nuisances are weighed."""
     slopes, _ = search.slopes(chosen, current)
     wide = search.screen(current.r, slopes=slopes)
-    ranked = [r for r in rank(wide, free) if r.valid]
+    ranked = [r for r in rank(wide, free, search.sizes) if r.valid]
     scale = 1.0
     for _ in range(_ROUNDS if ranked else 0):
         best = max(ranked[0].fit.train, 1.0)
@@ -158,7 +158,7 @@ def _ranked(
             break
         scale = best
         wide = search.screen(current.r, scale, slopes=slopes)
-        ranked = [r for r in rank(wide, free) if r.valid]
+        ranked = [r for r in rank(wide, free, search.sizes) if r.valid]
     return wide, scale, ranked
 
 

@@ -54,7 +54,9 @@ def _as_far_as_it_helps(
     while True:
         go_on()
         effects = each.candidate.effects(each.alternative, c)
-        if not (each.candidate.members or each.candidate.is_sane(effects)):
+        if not (
+            each.candidate.members or each.candidate.is_sane(effects, search.sizes)
+        ):
             break
         try:
             r = search.problem.residual([*(e.effect for e in chosen), *effects])

@@ -17,6 +17,7 @@ from makebreak.gap.thresholds import (
 )
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect
+from makebreak.models.effects.sizes import Sizes, range_of
 
 
 def units_of(chosen: Sequence["Choice"]) -> list[list["Choice"]]:
@@ -149,14 +150,16 @@ def why_not(other: Candidate, chosen: Candidate) -> str:
     return "the data hardly tell the two apart"
 
 
-def is_possible(fit: Fitted, of: Ranked, first: int) -> bool:
+def is_possible(fit: Fitted, of: Ranked, first: int, sizes: Sizes | None) -> bool:
     """Whether a fit ended at values that the scene and robots can have. first: index of
     the candidate's first effect in the fit."""
-    sane = of.candidate.is_sane(fit.effects[first:])
+    sane = of.candidate.is_sane(fit.effects[first:], sizes)
     return bool(np.isfinite(fit.score)) and sane
 
 
-def is_significant(choice: Choice, alone: bool = True) -> bool:
+def is_significant(
+    choice: Choice, alone: bool = True, sizes: Sizes | None = None
+) -> bool:
     """Whether an effect is certain: at least one parameter that makes it an effect is
     off neutral by more than its deviation and has a finite interval, and so have half
     of all parameters. For a kind whose parameters may end anywhere held-out rows may
@@ -178,7 +181,8 @@ def is_significant(choice: Choice, alone: bool = True) -> bool:
         if each.neutral is None and each.valid == ">= 0" and value == 0.0:
             continue  # At its limit it is as good as fixed, and has no interval.
         n += 1
-        infinite = not spread < each.high - each.low
+        low, high = range_of(each, choice.effect.at, sizes)
+        infinite = not spread < high - low
         unknown += infinite
         if each.neutral is not None:
             with_neutral += 1
@@ -216,13 +220,14 @@ def is_sure(choice: Choice) -> bool:
     )
 
 
-def identifiable(fit: Fitted, k: int = -1) -> int:
+def identifiable(fit: Fitted, sizes: Sizes | None, k: int = -1) -> int:
     """Number of parameters of effect k of a fit of which the data tell anything."""
     last, std = fit.effects[k], fit.std[k]
     return sum(
-        std.get(p.name, np.inf) < p.high - p.low
+        std.get(p.name, np.inf) < high - low
         for p in KINDS[last.kind].parameters
         if p.name in last.parameters
+        for low, high in [range_of(p, last.at, sizes)]
     )
 
 

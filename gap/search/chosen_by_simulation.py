@@ -168,7 +168,8 @@ def _fit(
         fit = fit_effects(problem, selection.screen(problem), effects, fixed)
     except ValueError:
         return None
-    return fit if all(map(is_sane, fit.effects)) else None
+    sizes = problem.sizes
+    return fit if all(is_sane(e, sizes) for e in fit.effects) else None
 
 
 def above_step(

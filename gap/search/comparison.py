@@ -35,6 +35,7 @@ from makebreak.gap.thresholds import (
     SAME_ERROR,
 )
 from makebreak.models.effects.kind import Effect
+from makebreak.models.effects.sizes import Sizes
 
 
 def _cost(b: np.ndarray, prior: np.ndarray) -> float:
@@ -59,6 +60,10 @@ class Comparison:
         """Nuisances and the fit without effects, by the rows' weights of now."""
         self.nuisances = self.problem.nuisances()
         self.start = fit_effects(self.problem, self.screen(self.problem.base()), ())
+
+    @property
+    def sizes(self) -> Sizes | None:
+        return self.problem.sizes
 
     def if_time(
         self, what: str, step: Callable, chosen: Sequence[Choice], current: Fitted

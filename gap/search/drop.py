@@ -339,7 +339,10 @@ def _is_certain(
     choice, alone = chosen[k], len(chosen) == 1
     kind, at = choice.effect.kind, choice.effect.at
     least = search.problem.least(kind, at)
-    if not is_significant(choice, alone) or not is_sane(choice.effect, least):
+    sizes = search.problem.sizes
+    if not (
+        is_significant(choice, alone, sizes) and is_sane(choice.effect, sizes, least)
+    ):
         return False
     # What was taken by evidence alone has to show by the weights of now, where that is
     # not enough.
@@ -354,6 +357,6 @@ def _is_certain(
     std, or_more = search.problem.widened(current, k)
     wide = replace(choice, std=choice.std | std)
     if endless:
-        return is_significant(wide, alone)
+        return is_significant(wide, alone, sizes)
     now = search.problem.dynamics.now(kind, at)
     return bool(or_more) or deviations_off(wide, now) > 1.0

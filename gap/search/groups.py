@@ -80,7 +80,7 @@ def of_more_kinds(
     wide = screen.beside(_columns_of(members)[0], FREE_TOLERANCE)
     score = search.error(wide.evaluate(wide.r).score)
     while True:
-        best = next((x for x in rank(wide, others) if x.valid), None)
+        best = next((x for x in rank(wide, others, search.sizes) if x.valid), None)
         if best is None:
             break
         less = search.error(best.fit.score)
@@ -139,7 +139,8 @@ def _pruned(
         members=tuple(members),
     )  # fmt: skip
     found = _beside_gains(search, candidate.effects(0, fit.c))
-    return Ranked(candidate, fit, found, True, 0) if candidate.is_sane(found) else None
+    sane = candidate.is_sane(found, search.sizes)
+    return Ranked(candidate, fit, found, True, 0) if sane else None
 
 
 def _with_one_value(
@@ -201,7 +202,7 @@ def _needless_member(
     own = [m.effects(0, fit.c[of == k]) for k, m in enumerate(members)]
     order = np.argsort([rms(each[held]) for each in without]).tolist()
     for k in order:
-        if not members[k].is_sane(own[k]):
+        if not members[k].is_sane(own[k], search.sizes):
             return k
     rows = [held & (search.channel == c) for c in np.unique(search.channel[held])]
     for k in order:

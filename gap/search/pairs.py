@@ -48,7 +48,9 @@ def pair_instead(
             *a.candidate.effects(a.alternative, both.c[:k]),
             *b.candidate.effects(b.alternative, both.c[k:]),
         )
-        if a.candidate.is_sane(effects[:1]) and b.candidate.is_sane(effects[1:]):
+        if a.candidate.is_sane(effects[:1], search.sizes) and b.candidate.is_sane(
+            effects[1:], search.sizes
+        ):
             pairs.append((both.score, a, b, effects))
     pairs.sort(key=lambda p: p[0])
     less = (1.0 - NESTED_GAIN) * search.error(fit.score)

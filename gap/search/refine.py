@@ -69,7 +69,8 @@ def _with(
     left = screen.fit_nuisances(current.r)[1]
     earned = search.earns_its_place(left, fit.left, gained)
     needed = search.is_needed(fit, current, more)
-    return fit if is_sane(fit.effects[k]) and earned and needed else None
+    sane = is_sane(fit.effects[k], search.sizes)
+    return fit if sane and earned and needed else None
 
 
 def _in_their_place(

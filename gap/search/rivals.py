@@ -205,7 +205,8 @@ class Rivals:
                 or max(f.score, fit.score) < floor
             )
             near = search.error(f.score) <= (1.0 + SAME_ERROR) * search.error(fit.score)
-            more = identifiable(fit) - identifiable(f)
+            sizes = search.sizes
+            more = identifiable(fit, sizes) - identifiable(f, sizes)
             worse = search.is_worse(f, fit, more) or search.is_louder(f, fit)
             if near and alike and worse:
                 continue
@@ -224,7 +225,8 @@ class Rivals:
         one = ranked.candidate
         if two.members or one.kind in KINDS[two.kind].contains:
             return False
-        more = identifiable(other.fit) - identifiable(fit)
+        sizes = self._search.sizes
+        more = identifiable(other.fit, sizes) - identifiable(fit, sizes)
         if more > EXTRA_PARAMETERS_MAX:
             search = self._search
             if not search.tells_by_evidence:
@@ -262,7 +264,8 @@ def still_tied(
 def _does_as_well(search: Comparison, fit: Fitted, current: Fitted, k: int) -> bool:
     """Whether a fit with another k-th effect explains the data as well."""
     near = search.error(fit.score) <= (1.0 + SAME_ERROR) * search.error(current.score)
-    more = identifiable(current, k) - identifiable(fit, k)
+    sizes = search.sizes
+    more = identifiable(current, sizes, k) - identifiable(fit, sizes, k)
     worse = search.is_worse(fit, current, more) or search.is_louder(fit, current)
     return near and search.is_alike(fit, current) and not worse
 
@@ -326,7 +329,7 @@ def with_rivals_of_pairs(
             rest = search.without(current.effects, k)
             screen = search.screen(search.problem.residual(rest), current.fit.train)
             near = [
-                r.candidate for r in rank(screen, free)
+                r.candidate for r in rank(screen, free, search.sizes)
                 if r.valid
                 and r.candidate.size <= choice.size + EXTRA_PARAMETERS_MAX
                 and choice.effect.kind not in KINDS[r.candidate.kind].contains
@@ -355,14 +358,14 @@ def in_place_of(
     try:
         without = search.problem.residual(rest)
         screen: Screen = search.screen(without, current.fit.train)
-        [ranked] = rank(screen, [candidate])
+        [ranked] = rank(screen, [candidate], search.sizes)
         trial = [*rest[:k], *ranked.effects, *rest[k:]]
         fit = fit_effects(search.problem, screen, trial, fixed)
     except (ValueError, RuntimeError):
         return None
     replaced = called(current.effects[k])
     search.say(f"  {candidate.name} in place of {replaced}: {fit.score:.3g}")
-    sane = candidate.is_sane(fit.effects[k : k + 1])
+    sane = candidate.is_sane(fit.effects[k : k + 1], search.sizes)
     return Trial(fit, ranked) if sane and np.isfinite(fit.score) else None
 
 

@@ -119,7 +119,7 @@ def fit_each(
         except ValueError:
             continue
         search.say(f"  {each.candidate.name}: {fit.score:.3g}")
-        if is_possible(fit, each, len(chosen)):
+        if is_possible(fit, each, len(chosen), search.sizes):
             found[k] = Trial(fit, each)
     trials = [found[k] for k in sorted(found)]
     if not known and search.plan.jumps:
@@ -147,7 +147,9 @@ def _search_finalists(
             better = fit_effects(search.problem, screen, effects, fixed)
         except ValueError:
             continue
-        if better.fit.train < fit.fit.train and is_possible(better, each, len(chosen)):
+        if better.fit.train < fit.fit.train and is_possible(
+            better, each, len(chosen), search.sizes
+        ):
             trials[k] = Trial(better, each)
             search.say(f"  {each.candidate.name}: {better.score:.3g}")
 

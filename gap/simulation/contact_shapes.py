@@ -11,7 +11,7 @@ makes of two surfaces.
 from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import combinations, product
 
 import numpy as np
 from pydrake.geometry import Box, Capsule, Convex, Cylinder, HalfSpace, Mesh, Sphere
@@ -353,6 +353,44 @@ class ContactShapes:
 
     def bodies(self) -> list[int]:
         return sorted({p.body for p in self.points} | {s.body for s in self.surfaces})
+
+    def close(
+        self,
+        poses: Mapping[int, tuple[np.ndarray, np.ndarray]],
+        near: float,
+        counts: Callable[[int, int], bool],
+    ) -> tuple[set[frozenset[int]], np.ndarray]:
+        """Pairs of bodies that count and may come nearer than `near` [m], as balls
+        about their shapes say, and at which poses (n,) one of them may."""
+        balls = {
+            k: (p + R @ centre, radius)
+            for k, (centre, radius) in self._balls().items() for R, p in (poses[k],)
+        }  # fmt: skip
+        pairs, rows = set(), np.zeros(len(next(iter(poses.values()))[1]), bool)
+        for a, b in combinations(balls, 2):
+            if counts(a, b) or counts(b, a):
+                (p_a, r_a), (p_b, r_b) = balls[a], balls[b]
+                here = np.linalg.norm(p_a - p_b, axis=1) < near + r_a + r_b
+                if here.any():
+                    pairs.add(frozenset((a, b)))
+                    rows |= here
+        return pairs, rows
+
+    def _balls(self) -> dict[int, tuple[np.ndarray, float]]:
+        """{body: middle (3,) in its frame and radius [m] of a ball about its shapes};
+        infinite where a surface is open."""
+        parts: dict[int, list[tuple[np.ndarray, float]]] = {}
+        for p in self.points:
+            half = 0.0 if p.along is None else float(np.linalg.norm(p.along))
+            parts.setdefault(p.body, []).append((p.p_B, p.radius + p.rim + half))
+        for s in self.surfaces:
+            parts.setdefault(s.body, []).append((s.p_BG, s.reach()))
+        found = {}
+        for body, each in parts.items():
+            middle = np.mean([p for p, _ in each], axis=0)
+            far = [float(np.linalg.norm(p - middle)) + r for p, r in each]
+            found[body] = middle, max(far)
+        return found
 
     def slots(
         self,

@@ -129,7 +129,7 @@ KINDS = {
     ),
     "actuator_bias": EffectKind(
         at="actuator",
-        parameters=(Parameter("bias", "N m", -20.0, 20.0),),
+        parameters=(Parameter("bias", "N m", -1.0, 1.0, of_size=True),),
         says="{at} adds a constant {bias} to the torque that it is commanded",
         says_less="{at} takes a constant {bias} away from the torque that it is "
         "commanded",
@@ -140,7 +140,9 @@ KINDS = {
     ),
     "actuator_saturation": EffectKind(
         at="actuator",
-        parameters=(Parameter("limit", "N m", 0.05, 200.0, None, valid="> 0"),),
+        parameters=(
+            Parameter("limit", "N m", 0.0, 4.0, None, valid="> 0", of_size=True),
+        ),
         says="{at} gives no more than {limit}",
         confused_with=("actuator_gain", "input_delay"),
         tries=_limits_to_try,
@@ -171,7 +173,9 @@ KINDS = {
     ),
     "servo_gain": EffectKind(
         at="drive",
-        parameters=(Parameter("kp", "N m/rad", 0.1, 5000.0, None, valid="> 0"),),
+        parameters=(
+            Parameter("kp", "N m/rad", 0.0, 200.0, None, valid="> 0", of_size=True),
+        ),
         says="the drive of {at} pulls towards its command with {kp}",
         confused_with=("actuator_gain", "payload", "joint_elasticity", "joint_spring"),
         exported="kp",

@@ -108,7 +108,9 @@ TRIED_FREQUENCIES = list(np.arange(0.4, 5.01, 0.03))  # [Hz]
 KINDS = {
     "constant_force": EffectKind(
         at="body",
-        parameters=tuple(Parameter(axis, "N", -100.0, 100.0) for axis in AXES),
+        parameters=tuple(
+            Parameter(axis, "N", -2.0, 2.0, of_size=True) for axis in AXES
+        ),
         says="a constant force of ({fx}, {fy}, {fz}) in world pulls at {at}, which the "
         "model lacks",
         confused_with=("payload", "gravity_tilt", "actuator_bias"),
@@ -121,7 +123,7 @@ KINDS = {
     "sinusoidal_force": EffectKind(
         at="body",
         parameters=(
-            *(Parameter(axis, "N", -100.0, 100.0) for axis in AXES),
+            *(Parameter(axis, "N", -2.0, 2.0, of_size=True) for axis in AXES),
             Parameter("frequency", "Hz", 0.05, 50.0, None, valid="> 0"),
             Parameter("phase", "rad", -math.pi, math.pi, None),
         ),
@@ -140,8 +142,8 @@ KINDS = {
     "body_drag": EffectKind(
         at="body",
         parameters=(
-            Parameter("linear", "N s/m", 0.0, 100.0, valid=">= 0"),
-            Parameter("angular", "N m s/rad", 0.0, 10.0, valid=">= 0"),
+            Parameter("linear", "N s/m", 0.0, 5.0, valid=">= 0", of_size=True),
+            Parameter("angular", "N m s/rad", 0.0, 1.0, valid=">= 0", of_size=True),
         ),
         says="{at} is slowed by drag of {linear} and {angular} that the model lacks",
         confused_with=(
@@ -157,7 +159,9 @@ KINDS = {
     ),
     "body_quadratic_drag": EffectKind(
         at="body",
-        parameters=(Parameter("coefficient", "N s2/m2", 0.0, 20.0, valid=">= 0"),),
+        parameters=(
+            Parameter("coefficient", "N s2/m2", 0.0, 5.0, valid=">= 0", of_size=True),
+        ),
         says="{at} is slowed by drag that grows with the square of its speed, "
         "{coefficient}, that the model lacks",
         confused_with=("body_drag", "joint_quadratic_drag", "constant_force"),

@@ -389,7 +389,7 @@ ROTOR = "rotor_inertia"
 KINDS = {
     "joint_viscous_damping": EffectKind(
         at="joint",
-        parameters=(Parameter("damping", "N m s/rad", -50.0, 50.0),),
+        parameters=(Parameter("damping", "N m s/rad", -2.0, 2.0, of_size=True),),
         says="{at} has {damping} of viscous damping that the model lacks",
         says_less="{at} has {damping} less of viscous damping than the model says",
         confused_with=(
@@ -407,7 +407,7 @@ KINDS = {
     ),
     "joint_coulomb_friction": EffectKind(
         at="joint",
-        parameters=(Parameter("coulomb", "N m", -50.0, 50.0),),
+        parameters=(Parameter("coulomb", "N m", -1.0, 1.0, of_size=True),),
         says="{at} has Coulomb friction of {coulomb} that the model lacks",
         says_less="{at} has {coulomb} less of Coulomb friction than the model says",
         confused_with=(
@@ -428,8 +428,8 @@ KINDS = {
     "joint_direction_friction": EffectKind(
         at="joint",
         parameters=(
-            Parameter("coulomb_plus", "N m", 0.0, 50.0, valid=">= 0"),
-            Parameter("coulomb_minus", "N m", 0.0, 50.0, valid=">= 0"),
+            Parameter("coulomb_plus", "N m", 0.0, 1.0, valid=">= 0", of_size=True),
+            Parameter("coulomb_minus", "N m", 0.0, 1.0, valid=">= 0", of_size=True),
         ),
         says="{at} has Coulomb friction that the model lacks: {coulomb_plus} where its "
         "position grows, {coulomb_minus} where it falls",
@@ -449,8 +449,8 @@ KINDS = {
     "joint_position_friction": EffectKind(
         at="joint",
         parameters=(
-            Parameter("coulomb_low", "N m", 0.0, 50.0, valid=">= 0"),
-            Parameter("coulomb_high", "N m", 0.0, 50.0, valid=">= 0"),
+            Parameter("coulomb_low", "N m", 0.0, 1.0, valid=">= 0", of_size=True),
+            Parameter("coulomb_high", "N m", 0.0, 1.0, valid=">= 0", of_size=True),
             Parameter("low", "rad", -1e3, 1e3, None, given=True),
             Parameter("high", "rad", -1e3, 1e3, None, given=True),
         ),
@@ -490,8 +490,8 @@ KINDS = {
     "joint_stribeck_friction": EffectKind(
         at="joint",
         parameters=(
-            Parameter("coulomb", "N m", 0.0, 50.0, valid=">= 0"),
-            Parameter("static", "N m", 0.0, 100.0, valid=">= 0"),
+            Parameter("coulomb", "N m", 0.0, 1.0, valid=">= 0", of_size=True),
+            Parameter("static", "N m", 0.0, 2.0, valid=">= 0", of_size=True),
             Parameter("stribeck_velocity", "rad/s", 0.005, 1.0, None, valid="> 0"),
         ),
         says="{at} has dry friction that the model lacks: {static} when it starts, "
@@ -507,7 +507,7 @@ KINDS = {
     ),
     "joint_quadratic_drag": EffectKind(
         at="joint",
-        parameters=(Parameter("coefficient", "N m s2/rad2", -20.0, 20.0),),
+        parameters=(Parameter("coefficient", "N m s2/rad2", -1.0, 1.0, of_size=True),),
         says="{at} has drag that grows with the square of its speed, {coefficient}, "
         "that the model lacks",
         says_less="{at} has {coefficient} less of the drag that grows with the square "
@@ -522,7 +522,7 @@ KINDS = {
     ),
     ROTOR: EffectKind(
         at="joint",
-        parameters=(Parameter("inertia", "kg m2", -20.0, 20.0),),
+        parameters=(Parameter("inertia", "kg m2", -2.0, 2.0, of_size=True),),
         says="{at} turns a rotor with {inertia} (reflected at the joint) that the "
         "model lacks",
         says_less="the rotor of {at} has {inertia} less (reflected at the joint) than "
@@ -539,7 +539,7 @@ KINDS = {
     "torque_ripple": EffectKind(
         at="joint",
         parameters=(
-            Parameter("amplitude", "N m", 0.0, 10.0),
+            Parameter("amplitude", "N m", 0.0, 0.2, of_size=True),
             Parameter("periods_per_rev", "periods a turn", 2.0, 100.0, None),
             Parameter("phase", "rad", -math.pi, math.pi, None),
         ),
@@ -559,7 +559,7 @@ KINDS = {
     "joint_spring": EffectKind(
         at="joint",
         parameters=(
-            Parameter("stiffness", "N m/rad", 0.0, 200.0),
+            Parameter("stiffness", "N m/rad", 0.0, 2.0, of_size=True),
             Parameter("rest", "rad", -math.pi, math.pi, None),
         ),
         says="a spring or a cable of {stiffness} pulls {at} to {rest}, which the model "

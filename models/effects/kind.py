@@ -22,6 +22,7 @@ from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
 from makebreak.models.typed_yaml import nearest
 
 _MAX_OVER_RANGE = 1e4  # Bound of a parameter over its search range.
+_MAX_SI = 1e9  # The same of one whose range goes with the size of the scene.
 _MAX_SEC = 10.0  # Bound of a delay, whose samples are stored.
 
 
@@ -49,6 +50,7 @@ class Parameter:
     """One parameter of a kind.
 
     low, high: range in real robots, in which a search looks for it; not limits.
+    of_size: whether low and high are multiples of a size of the scene (sizes.py).
     neutral: the value without effect; None if that is the model's own value
         (EffectKind.now), or if another parameter has to be neutral instead.
     valid: valid values: "any", ">= 0", "> 0" or "share" (from 0 to below 1).
@@ -74,12 +76,15 @@ class Parameter:
     ends: bool = False
     refines: bool = False
     given: bool = False
+    of_size: bool = False
 
     @property
     def most(self) -> float:
         """Largest magnitude accepted; more is a wrong unit, or too much data."""
         if self.unit == "s":
             return _MAX_SEC
+        if self.of_size:
+            return _MAX_SI
         return _MAX_OVER_RANGE * max(abs(self.low), abs(self.high))
 
 

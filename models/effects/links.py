@@ -121,7 +121,7 @@ KINDS = {
     # The moments of inertia scale with the mass: its distribution stays.
     "link_mass": EffectKind(
         at="body",
-        parameters=(Parameter("mass", "kg", -20.0, 20.0),),
+        parameters=(Parameter("mass", "kg", -2.0, 2.0, of_size=True),),
         says="{at} is {mass} heavier than in the model",
         says_less="{at} is {mass} lighter than in the model",
         confused_with=("payload", "link_com", "actuator_gain", "constant_force"),

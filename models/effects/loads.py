@@ -289,7 +289,7 @@ KINDS = {
     "payload": EffectKind(
         at="body",
         parameters=(
-            Parameter("mass", "kg", -20.0, 20.0),
+            Parameter("mass", "kg", -2.0, 2.0, of_size=True),
             *(Parameter(name, "m", -PLACE_MAX, PLACE_MAX, None) for name in _PLACE),
             Parameter(_EXTENT, "m", 0.0, 0.3, 0.0, ">= 0", optional=True, refines=True),
         ),

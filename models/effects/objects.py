@@ -319,7 +319,9 @@ KINDS = {
     ),
     "object_mass": EffectKind(
         at="body",
-        parameters=(Parameter("mass", "kg", 0.001, 50.0, None, valid="> 0"),),
+        parameters=(
+            Parameter("mass", "kg", 0.0, 5.0, None, valid="> 0", of_size=True),
+        ),
         says="{at} weighs {mass}",
         confused_with=("contact_friction", "object_inertia", "payload"),
         exported="inertia",
@@ -363,7 +365,7 @@ KINDS = {
     "object_inertia": EffectKind(
         at="body",
         parameters=tuple(
-            Parameter(a, "kg m2", 1e-7, 5.0, None, valid="> 0", optional=True)
+            Parameter(a, "kg m2", 0.0, 10.0, None, "> 0", optional=True, of_size=True)
             for a in ("ixx", "iyy", "izz")
         ),
         says="{at} has moments of inertia[ ixx = {ixx}][ iyy = {iyy}][ izz = {izz}] "

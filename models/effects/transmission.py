@@ -494,8 +494,12 @@ KINDS = {
     "joint_elasticity": EffectKind(
         at="joint",
         parameters=(
-            Parameter("stiffness", "N m/rad", 10.0, 1e5, None, valid="> 0"),
-            Parameter("damping", "N m s/rad", 0.0, 100.0, None, valid=">= 0"),
+            Parameter(
+                "stiffness", "N m/rad", 0.02, 200.0, None, valid="> 0", of_size=True
+            ),
+            Parameter(
+                "damping", "N m s/rad", 0.0, 1.0, None, valid=">= 0", of_size=True
+            ),
         ),
         says="motor and link of {at} are joined by a spring of {stiffness} (damping "
         "{damping}) that the model lacks",
