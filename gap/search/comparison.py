@@ -63,6 +63,7 @@ class Comparison:
 
     @property
     def sizes(self) -> Sizes | None:
+        """Those of the problem's scene."""
         return self.problem.sizes
 
     def if_time(
