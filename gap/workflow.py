@@ -41,7 +41,7 @@ from makebreak.gap.data.conditioning import condition
 from makebreak.gap.data.content import check_contents
 from makebreak.gap.data.effort_loops import OF_LOOP, SHARES, of_loops
 from makebreak.gap.data.findings import Finding
-from makebreak.gap.data.pieces import excerpt
+from makebreak.gap.data.pieces import excerpt, without_stops
 from makebreak.gap.data.reading import check_against_scene, read_recordings
 from makebreak.gap.data.recording import Recording, unit_of
 from makebreak.gap.data.scene_facts import scene_facts, scene_names
@@ -211,6 +211,8 @@ def _run(
     recordings = of_loops(as_used(recordings, dynamics))
     if scene.actuation.hold == "first_order":
         recordings = [in_lines(r) for r in recordings]
+    recordings, stops = without_stops(recordings, scene_facts(dynamics.plant))
+    checks += stops
     check_initial_names(scene, recordings)
     check_couplings(scene, dynamics.plant)
     check_meshes(dynamics.loaded, recordings)

@@ -111,7 +111,32 @@ def _compiled(path: Path):
         raise ValueError(f"{path}: MuJoCo says: {' '.join(str(error).split())}") from (
             None
         )
+    _apply_flags(model)
     return spec, model, left_out
+
+
+def _apply_flags(m) -> None:
+    """Takes out of a compiled model what its option flags switch off."""
+    import mujoco
+
+    off, bits = int(m.opt.disableflags), mujoco.mjtDisableBit
+    by_flag = {
+        bits.mjDSBL_EQUALITY: [m.eq_active0],
+        bits.mjDSBL_FRICTIONLOSS: [m.dof_frictionloss, m.tendon_frictionloss],
+        bits.mjDSBL_LIMIT: [m.jnt_limited, m.tendon_limited],
+        bits.mjDSBL_CONTACT: [m.geom_contype, m.geom_conaffinity],
+        bits.mjDSBL_SPRING: [m.jnt_stiffness, m.tendon_stiffness],
+        bits.mjDSBL_DAMPER: [m.dof_damping, m.tendon_damping],
+        bits.mjDSBL_GRAVITY: [m.opt.gravity],
+        bits.mjDSBL_CLAMPCTRL: [m.actuator_ctrllimited],
+        bits.mjDSBL_ACTUATION: [m.actuator_gainprm, m.actuator_biasprm],
+    }
+    constraints = list(by_flag)[:4]
+    for bit, arrays in by_flag.items():
+        all_of_them = bit in constraints and off & int(bits.mjDSBL_CONSTRAINT)
+        if off & int(bit) or all_of_them:
+            for each in arrays:
+                each[:] = 0
 
 
 def _unreadable_meshes(spec, folder: Path) -> set[str]:
@@ -469,7 +494,7 @@ class _Writer:
         m, mj = self.m, self.mj
         lost: dict[str, int] = {}
         found = ET.SubElement(root, "equality")
-        for e in range(m.neq):
+        for e in np.flatnonzero(m.eq_active0):
             kind = mj.mjtEq(m.eq_type[e])
             if kind == mj.mjtEq.mjEQ_JOINT and m.eq_obj2id[e] >= 0:
                 ET.SubElement(

@@ -10,6 +10,7 @@ from makebreak.diagrams.station import BALL_ROLLING
 from makebreak.gap.data.check_motion import excitation, free_flight_gravity
 from makebreak.gap.data.checks import check_recordings
 from makebreak.gap.data.findings import JointFacts, SceneFacts
+from makebreak.gap.data.pieces import without_stops
 from makebreak.gap.data.reading import check_against_scene, read_recording
 from makebreak.gap.data.scene_facts import scene_facts, scene_names
 from makebreak.gap.data.table import write_recording
@@ -340,10 +341,23 @@ def test_a_joint_that_lies_at_a_limit_is_told(tmp_path, upper):
     y = np.minimum(np.sin(2.0 * t), upper) + 3e-5 * rng.normal(size=N)
     write_recording(tmp_path / "r.npz", {"time": t, "arm.j0.position": y})
     facts = SceneFacts(joints={"arm.j0": JointFacts(lower=-3.0, upper=upper)})
-    found = check_recordings([read_recording(tmp_path / "r.npz")], facts)
-    sizes = [f.size for f in found if f.kind == "at_limit"]
+    recording = read_recording(tmp_path / "r.npz")
+    (less,), found = without_stops([recording], facts)
     share = np.mean(np.sin(2.0 * t) > upper)  # A fifth, or none.
+    sizes = [f.size for f in found]
     assert sizes == pytest.approx([share] if share else [], abs=0.005)
+    assert (less is recording) == (not share)
+    assert np.nanmax(less["arm.j0.position"]) < upper
+    # A limit that a joint goes beyond stops nothing.
+    far = SceneFacts(joints={"arm.j0": JointFacts(lower=-3.0, upper=0.5)})
+    assert without_stops([recording], far) == ([recording], [])
+    # Where it lies there, all that is left is said.
+    low = SceneFacts(joints={"arm.j0": JointFacts(lower=-3.0, upper=-0.95)})
+    lies = np.minimum(y, -0.95)
+    write_recording(tmp_path / "l.npz", {"time": t, "arm.j0.position": lies})
+    recording = read_recording(tmp_path / "l.npz")
+    out, (said,) = without_stops([recording], low)
+    assert out == [recording] and said.severity == "warning"
 
 
 def test_nothing_is_told_of_too_little_or_of_a_constant():

@@ -16,8 +16,6 @@ from makebreak.gap.data.findings import (
 )
 from makebreak.gap.data.recording import Recording, unit_of
 
-AT_LIMIT = 0.05  # Of all rows, at which a joint is at a limit of its positions.
-
 
 def check_gravity(recording: Recording, facts: SceneFacts) -> list[Finding]:
     """Apparent gravity of what flies freely: a length or clock scale shows in it."""
@@ -134,17 +132,6 @@ def check_excitation(recording: Recording, facts: SceneFacts) -> list[Finding]:
         def add(kind: str, size: float, unit: str, says: str, name=name) -> None:
             found.append(Finding(kind, recording.name, name, size, unit, "info", says))
 
-        y, near = recording[name], 3.0 * recording.channels[name].noise
-        share = float(np.mean((y < own.lower + near) | (y > own.upper - near)))
-        if share > AT_LIMIT:
-            says = (
-                f"{at} is at a limit of its positions, {own.lower:.3g} to "
-                f"{own.upper:.3g} {unit}, in {100 * share:.0f} % of the rows: what a "
-                "stop gives it there is in no equation."
-            )
-            found.append(
-                Finding("at_limit", recording.name, name, share, "1", "warning", says)
-            )
         if e.range < 20.0 * recording.channels[name].noise:
             says = (
                 f"{at} hardly moves ({e.range:.2g} {unit}): its effects are not "

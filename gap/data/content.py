@@ -44,6 +44,7 @@ TOLD_WELL = 0.01  # Of what is predicted: no other unit can tell it much better.
 LEAST_LEFT = 1e-5  # Less is rounding.
 GIVES_WAY = 0.05  # [rad], [m]
 LEAST_TOLD = 0.3  # Of a column that is not noise, to judge it without that.
+TURNED = 0.2  # Of gravity, by which it is another one.
 WELL_HUNG = 0.25  # Of efforts, left by gravity of another direction and friction.
 PARTS = 5  # Of the data: a factor scatters over them.
 KNOWN_TO = 0.1  # Of a factor, 1 sigma.
@@ -425,7 +426,8 @@ def turned_gravity(
     matches: Sequence[Match],
 ) -> np.ndarray | None:
     """(3,) gravity [m/s2] in world with which the efforts go with the motion, as where
-    the base hangs from a wall; None where none does."""
+    the base hangs from a wall; None where none does, or it is so near the file's that
+    the search may tell it (gravity_tilt)."""
     try:
         contents = Contents(plant, joints, columns, matches)
     except ValueError:
@@ -436,7 +438,9 @@ def turned_gravity(
     left = [contents.told(name, i).left for i, name in efforts.items()]
     much = max(1.0 - EXPLAINS, CLEARER * rest)
     clear = off < KNOWN_TO and rest < WELL_HUNG and np.median(left or [0.0]) > much
-    return g if clear else None
+    file = plant.gravity_field().gravity_vector()
+    turned = float(np.linalg.norm(g - file)) > TURNED * float(np.linalg.norm(g))
+    return g if clear and turned else None
 
 
 # ----- What has no content

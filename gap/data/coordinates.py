@@ -15,6 +15,7 @@ from makebreak.gap.data.arrays import words_of
 from makebreak.gap.data.base_pose import are_quaternion
 from makebreak.gap.data.match import Match
 
+OF_ACTUATORS = "a list of all actuators"
 _VELOCITIES = {7: 6, 4: 3, 1: 1}  # Of a free body, a ball joint, a joint.
 _STATE = set("q qpos pos position positions x state states column conf".split())
 _SPEED = set("v qvel vel velocity velocities dq qd qdot".split())
@@ -50,18 +51,20 @@ def by_lists(
         if actuators and len(names) == len(actuators) and (force or words & _GIVEN):
             what = "effort_measured" if force else "effort_command"
             for name, (joint, gear) in zip(names, actuators, strict=True):
-                why = "a list of all actuators"
                 if not joint:
-                    found[name] = Match(name, None, why=f"{why}: of no joint")
+                    why = f"{OF_ACTUATORS}: of no joint"
+                    found[name] = Match(name, None, why=why)
                     continue
-                own = Match(name, f"{model}.{joint}.{what}", why=why)
+                own = Match(name, f"{model}.{joint}.{what}", why=OF_ACTUATORS)
                 found[name] = replace(own, scale=gear) if force else own
     return found
 
 
 def _lists(columns: Mapping[str, np.ndarray]) -> Iterator[tuple[str, list[str]]]:
-    """Names that differ in the number at their end, which counts on."""
+    """Names that differ in the number at their end, which counts on; or one that has
+    none, and says nothing but what an actuator is given."""
     lists: dict[str, list[tuple[int, str]]] = {}
+    yield from ((name, [name]) for name in columns if {*words_of(name)} <= _GIVEN)
     for name in columns:
         if parts := re.fullmatch(r"(.*?)(\d+)\W*", name):
             lists.setdefault(parts[1], []).append((int(parts[2]), name))

@@ -31,7 +31,7 @@ from makebreak.gap.data.content import (
     told_by,
     turned_gravity,
 )
-from makebreak.gap.data.coordinates import by_lists
+from makebreak.gap.data.coordinates import OF_ACTUATORS, by_lists
 from makebreak.gap.data.findings import (
     FIXED,
     GUESSED_GAINS,
@@ -231,7 +231,8 @@ def _instance(plant: MultibodyPlant):
 def _standing(robot: Robot, every, logs, some_unknown: bool) -> dict[str, float]:
     """{<model>.<joint>: position} of joints that a scene takes to stand still: those
     that follow one another (mimic), where they were in the middle of a log, and those
-    that no log has a column of. Neither may carry others, as a gripper's fingers.
+    that no log has a column of, neither of which may carry others, as a gripper's
+    fingers; and those of which nothing that a log has ever changes.
 
     Args: some_unknown: whether there are columns of unknown joints, maybe theirs.
     Raises: ValueError for coupled joints that carry others.
@@ -245,7 +246,13 @@ def _standing(robot: Robot, every, logs, some_unknown: bool) -> dict[str, float]
     follow = {*coupled, *(of.joint for of in coupled.values())}
     found = {}
     for joint in robot.joints:
-        if joint.name in seen and joint.name not in follow:
+        own = [y[np.isfinite(y)] for channels in scaled
+               for name, y in channels.items() if name.rpartition(".")[0] == joint.name
+        ]  # fmt: skip
+        still = joint.name in seen and all(np.ptp(y) == 0.0 for y in own if len(y))
+        if still and not any(map(len, own)):
+            still = False
+        if joint.name in seen and joint.name not in follow and not still:
             continue
         carried = _carried_by(robot, joint.name) - follow
         if joint.name in follow and carried:
@@ -254,7 +261,8 @@ def _standing(robot: Robot, every, logs, some_unknown: bool) -> dict[str, float]
                 f"(mimic) and carries {', '.join(sorted(carried))}; coupled joints are "
                 "covered only at the end of a robot, as a gripper's fingers"
             )
-        if joint.name not in follow and (carried & seen or some_unknown):
+        known = still or joint.name in follow
+        if not known and (carried & seen or some_unknown):
             continue  # Where it stands would be a guess.
         q = [c[f"{joint.name}.position"] for c in scaled
              if f"{joint.name}.position" in c]  # fmt: skip
@@ -947,7 +955,9 @@ def _through_drives(
             why = f"what {file}'s actuator makes of it is not known"
             match, drive = replace(match, channel=None, why=why), None
         if drive is not None and what in COMMANDS:
-            is_own = what == "effort_command" and "ctrl" in words_of(match.column)
+            is_own = what == "effort_command" and (
+                match.why == OF_ACTUATORS or "ctrl" in words_of(match.column)
+            )
             act, servo = drive.activation, drive.kp or drive.kd
             adds_up = act is not None and not act.lag
             if is_own and servo or adds_up and drive.kp and what == "velocity_command":

@@ -200,10 +200,13 @@ class _Reading:
 
 
 class _Columns:
-    """A joint's columns. q: the match of its position, v: of its velocity, or None."""
+    """A joint's columns. q: the match of its position, v: of its velocity, or None.
+    free: whether nothing drives it and something drives others."""
 
-    def __init__(self, joint: JointName, q: Match, v: Match | None, columns, time):
-        self.joint, self.q, self.v = joint, q, v
+    def __init__(
+        self, joint: JointName, q: Match, v: Match | None, columns, time, free: bool
+    ):
+        self.joint, self.q, self.v, self.free = joint, q, v, free
         self.values, self.jump = _unwound(columns[q.column], joint.prismatic)
         self.ratio = None
         if v is not None and time is not None:
@@ -245,8 +248,10 @@ class _Columns:
         low, high = float(np.nanmin(q)), float(np.nanmax(q))
         j = self.joint
         if not np.isfinite(j.upper - j.lower):
-            # A wheel goes on and on, in rad; an arm comes back.
+            # A wheel goes on and on, in rad; an arm comes back, and what swings freely
+            # may turn over and back.
             large = max(abs(low), abs(high)) > _LARGE and not j.prismatic
+            large &= not self.free
             there = q[np.isfinite(q)]
             back = abs(there[-1] - there[0]) < _BACK * (high - low)
             return 0.0, _UNLIMITED if large and back else 0.0
@@ -313,12 +318,15 @@ def in_units(
     in_range = _of_ranges(out, columns, of, ranges or {})
     channel = {m.channel: m for m in (out | in_range).values() if m.channel}
     time = channel.get("time")
+    driven = {at for at, _, what in (name.rpartition(".") for name in channel)
+              if what.endswith("_command") or what.startswith("effort")}  # fmt: skip
     groups: dict[bool, list[_Columns]] = {False: [], True: []}
     for joint in joints:
         q = channel.get(f"{joint.name}.position")
         if q is not None and q.column not in in_range and _is_there(columns[q.column]):
             v = channel.get(f"{joint.name}.velocity")
-            groups[joint.prismatic].append(_Columns(joint, q, v, columns, time))
+            free = bool(driven) and joint.name not in driven
+            groups[joint.prismatic].append(_Columns(joint, q, v, columns, time, free))
     chosen, tick = _chosen(groups, time)
     if time is not None and tick != 1.0:
         scale = time.scale * tick

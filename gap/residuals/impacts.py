@@ -16,7 +16,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex
 
 from makebreak.gap.data.findings import Finding
-from makebreak.gap.data.pieces import part_of
+from makebreak.gap.data.pieces import MOST_SHARE, less_of, part_of
 from makebreak.gap.data.recording import FEWEST_ROWS, Episode, Recording
 from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.numerics.runs import runs_of
@@ -42,11 +42,9 @@ AS_LONG = 0.8  # As the longest free windows; some are much shorter.
 LOOKS = 4000  # Rows at which it is first asked whether anything comes near.
 NEAR = 0.01  # [m]
 FEWEST = 3  # Touches.
-MOST_SHARE = 0.5  # Of the time, that may be spent in touch: else it lies there.
 # Rows beside a touch between which an approach changes, and by how many times what it
 # nearly always does elsewhere.
 BESIDE, FELT = 2, 2.0
-BESIDE_SEC, LEAST_SEC = 0.1, 0.5  # About a touch; a stretch without one.
 DRAWS = 3  # Of uncertain starts.
 BLUR = 0.003  # Of how far a channel goes in a window: laws are no better.
 TRIED = (0.2, 0.4, 0.7, 0.9, 1.15, 1.7, 2.6, 4.5)  # Times what the scene has.
@@ -117,29 +115,11 @@ def without_contact(
 
 
 def _apart(dynamics: SceneDynamics, shapes, recording: Recording):
-    """Episodes without touches and how long the rest is; None: nothing touches; no
-    episodes where too much would be left out."""
-    q = positions(dynamics, recording)
-    episodes: list[Episode] = []
-    seconds, some = 0.0, False
+    """As less_of where anything touches; None: nothing does."""
+    q, near = positions(dynamics, recording), np.zeros(len(recording.time), bool)
     for episode in recording.episodes:
-        time = recording.time[episode.rows]
-        near = nearest(shapes, dynamics, q[episode.rows]) < 0.0
-        some |= bool(near.any())
-        for k in np.flatnonzero(near):
-            near |= np.abs(time - time[k]) < BESIDE_SEC
-        seconds += float(np.median(np.diff(time)) * near.sum())
-        for number, (a, b) in enumerate(runs_of(~near)):
-            if b - a >= FEWEST_ROWS and time[b - 1] - time[a] >= LEAST_SEC:
-                first, last = episode.first + a, episode.first + b
-                episodes.append(
-                    Episode(episode.number, first, last, episode.stretch + number)
-                )
-    if not some:
-        return None
-    return (
-        episodes if seconds < MOST_SHARE * recording.duration_sec() else []
-    ), seconds
+        near[episode.rows] = nearest(shapes, dynamics, q[episode.rows]) < 0.0
+    return less_of(recording, near) if near.any() else None
 
 
 def _now_and_then(dynamics: SceneDynamics, shapes, recordings) -> bool:
