@@ -129,3 +129,68 @@ def test_what_is_added_up_begins_again_with_an_episode():
     u = np.array([1.0, np.nan, 2.0, 3.0, 0.0])
     act = Activation(start=0.5).of(u, time)
     np.testing.assert_allclose(act, [0.5, 0.6, 0.7, 0.5, 0.8])
+
+
+SWUNG = """<mujoco><option timestep="0.001"><flag {flag}="disable"/></option>
+<worldbody><geom type="plane" size="1 1 0.1"/><body pos="0 0 0.5">
+<joint name="rail" type="slide" axis="1 0 0" range="-1 1" frictionloss="0.5"
+ limited="true" stiffness="2" damping="0.3"/><geom type="box" size="0.1 0.1 0.05"/>
+<body><joint name="pole" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 0.6"
+ size="0.02"/></body><body><joint name="goal" type="slide" axis="0 1 0"/>
+<geom type="sphere" size="0.01"/></body></body></worldbody>
+<actuator><motor joint="rail" gear="20"/></actuator></mujoco>"""
+
+
+def swung(folder, flag="contact"):
+    (folder / "a.xml").write_text(SWUNG.format(flag=flag))
+    m = mujoco.MjModel.from_xml_path(str(folder / "a.xml"))
+    d, rows = mujoco.MjData(m), {k: [] for k in ("time", "qpos", "qvel", "ctrl")}
+    d.qvel[1] = 9.0
+    for k in range(8000):
+        d.ctrl[0] = np.sin(5.0 * d.time)
+        if k % 10 == 0:
+            for name, values in rows.items():
+                values.append(np.copy(getattr(d, name)))
+        mujoco.mj_step(m, d)
+    np.savez(folder / "log.npz", **{k: np.array(x) for k, x in rows.items()})
+    return m, read_robot(folder / "a.xml"), read_log(folder / "log.npz")
+
+
+def test_a_list_of_one_actuator_and_a_joint_that_stands_still(tmp_path):
+    _, robot, log = swung(tmp_path)
+    assert np.ptp(log.table.columns["qpos[1]"]) > 15.0  # It turns over and over.
+    proposal = propose_scene(robot, [log])
+    sidecar = proposal.sidecars[log.path]
+    assert "ctrl: {channel: a.rail.effort_command, scale: 20.0}" in sidecar
+    assert "'qpos[1]': a.pole.position" in sidecar  # In rad.
+    assert "fixed_joints: {a.goal: 0}" in proposal.scene
+    assert not {"units", "position_from_start"} & {s.kind for s in proposal.said}
+
+
+@pytest.mark.parametrize(
+    ("flag", "gone"),
+    [
+        ("gravity", {"gravity"}),
+        ("contact", {"contact"}),
+        ("frictionloss", {"friction"}),
+        ("limit", {"limit"}),
+        ("damper", {"damping"}),
+        ("spring", {"spring"}),
+        ("constraint", {"contact", "friction", "limit"}),
+        ("midphase", set()),
+    ],
+)
+def test_what_a_flag_of_mujoco_switches_off_is_not_in_the_scene(tmp_path, flag, gone):
+    (tmp_path / "a.xml").write_text(SWUNG.format(flag=flag))
+    robot = read_robot(tmp_path / "a.xml")
+    rail = robot.plant.GetJointByName("rail")
+    kinds = {e.kind for e in robot.file.effects}
+    there = {
+        "gravity": robot.file.gravity[2] != 0.0,
+        "contact": robot.file.has_ground,
+        "friction": "joint_coulomb_friction" in kinds,
+        "limit": bool(np.isfinite(rail.position_upper_limits()[0])),
+        "damping": bool(rail.default_damping_vector()[0]),
+        "spring": "joint_spring" in kinds,
+    }
+    assert {name for name, is_there in there.items() if not is_there} == gone

@@ -71,6 +71,7 @@ WITHOUT_WEIGHT = "effort_without_weight"
 UNSURE, UNITS_UNSURE, LATE = "effort_unsure", "units_unsure", "effort_late"
 FROM_A_START, TARED = "position_from_start", "effort_tared"
 AT_ZERO = 1e-3  # [rad], [m]
+ZERO_STEPS, ZEROS = (0.5, 0.5, 0.1), 6  # [rad] of zeros that are tried, on either side.
 UNEXPLAINED, MIRRORED = "effort_unexplained", "joints_mirrored"
 _UNSURE = (
     "larger than the model needs, several times, and no rotor would do: another unit, "
@@ -1001,18 +1002,38 @@ def _unexplained(contents: Contents, matches, said) -> None:
 
 def _from_a_start(contents: Contents, matches, said) -> None:
     """Says where positions may count from where the log begins, as incremental encoders
-    do: all begin at 0, and the efforts are others than there."""
+    do: all begin at 0, and with other zeros the efforts go with the motion better."""
     efforts = _columns_of(contents, matches, _DRIVES)
     moving = [i for i in range(len(contents.joints)) if contents.moves(i)]
     if len(moving) < 2 or not (np.abs(contents.first[moving]) < AT_ZERO).all():
         return
-    if efforts and _misfit(contents, efforts) > np.log(TOLD_WELL):
+    if efforts and _other_zeros_fit(contents, efforts):
         says = (
             "All positions begin at 0, and the efforts are not those that the model "
             "needs from there: do they count from where the log, or the robot, was "
             "started? Then give each its offset in the sidecar."
         )
         said.append(Said(FROM_A_START, contents.joints[moving[0]].name, 0.0, says))
+
+
+def _other_zeros_fit(contents: Contents, efforts: Mapping[int, str]) -> bool:
+    """Whether some zeros of the joints that turn, tried one joint after another all
+    round, leave several times less of the efforts."""
+    few = contents.fewer(FEW)
+    first = least = _misfit(few, efforts)
+    if first < np.log(TOLD_WELL):
+        return False
+    turn = [i for i, joint in enumerate(few.joints) if not joint.prismatic]
+    for step in ZERO_STEPS:
+        around = step * np.arange(-ZEROS, ZEROS + 1)
+        for i in turn:
+            best = few.reading
+            for reading in [best.turned(i, float(angle)) for angle in around]:
+                few.read(reading)
+                if (left := _misfit(few, efforts)) < least:
+                    best, least = reading, left
+            few.read(best)
+    return least < first - np.log(CLEARER)
 
 
 def _late(contents: Contents, matches, said) -> None:

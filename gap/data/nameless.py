@@ -30,8 +30,8 @@ def layouts(
 ) -> list[tuple[dict[str, str], list[Match]]]:
     """{quantity: its first column}, and matches of all columns, for each way in which
     columns that are numbered (column_1, state[0]) may be laid out; none where others
-    are unknown, too, or numbers are no more than joints. Where positions are commanded,
-    as many columns as joints that go after these are the positions.
+    are unknown, too, or numbers are no more than joints. Where commands are known, as
+    many columns as joints that go after these are the positions.
 
     Args: columns {name: (n,)} and their matches; joints in the robot's order.
     """
@@ -53,7 +53,8 @@ def layouts(
     good = np.isfinite(X).all(axis=1) & np.isfinite(t)
     found = []
     commands = [columns[m.column][good] for j in joints for m in matches
-                if m.channel == f"{j.name}.position_command"]  # fmt: skip
+                if (m.channel or "").startswith(f"{j.name}.")
+                and m.channel.endswith("_command")]  # fmt: skip
     only = len(names) == n == len(commands) and all(
         _goes_after(*pair) for pair in zip(commands, X[good].T, strict=True)
     )
