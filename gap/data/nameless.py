@@ -53,8 +53,8 @@ def layouts(
     good = np.isfinite(X).all(axis=1) & np.isfinite(t)
     found = []
     commands = [columns[m.column][good] for j in joints for m in matches
-                if (m.channel or "").startswith(f"{j.name}.")
-                and m.channel.endswith("_command")]  # fmt: skip
+                if m.channel in (f"{j.name}.position_command",
+                                 f"{j.name}.effort_command")]  # fmt: skip
     only = len(names) == n == len(commands) and all(
         _goes_after(*pair) for pair in zip(commands, X[good].T, strict=True)
     )
