@@ -379,7 +379,10 @@ def test_shapes_that_pass_through_their_own_base_are_not_struck(tmp_path, is_str
     recordings = read_recordings([tmp_path / "log.csv"])
     q = positions(dynamics, recordings[0])
     shapes = walls_of(dynamics, own=True)
-    np.testing.assert_allclose(nearest(shapes, dynamics, q), 0.08 - x, atol=1e-5)
+    far = nearest(shapes, dynamics, q, np.inf)
+    np.testing.assert_allclose(far, 0.08 - x, atol=1e-5)
+    near = nearest(shapes, dynamics, q, 0.02)
+    np.testing.assert_array_equal(near, np.where(far < 0.02, far, np.inf))
     assert _overlaps(dynamics, recordings) >= 3
     assert runs_against(dynamics, recordings) == is_struck
     assert bool(without_contact(dynamics, recordings)[1]) == is_struck

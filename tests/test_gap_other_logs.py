@@ -484,7 +484,7 @@ def test_a_member_of_a_group_within_the_tolerance_must_show_by_itself(within):
 
     search = SimpleNamespace(
         train=train, channel=channel,
-        problem=SimpleNamespace(is_within_tolerance=is_within),
+        problem=SimpleNamespace(is_within_tolerance=is_within), sizes=None,
     )  # fmt: skip
     screen = Screen(left, np.zeros((m, 0)), np.zeros(0), train)
     assert _needless_member(search, screen, members) == (1 if within else None)

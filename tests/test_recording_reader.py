@@ -314,7 +314,7 @@ def test_recordings_of_one_name_are_told_apart_by_their_folder(tmp_path):
         ("noise: {arm.j1.position: small}", "is 'small', expected a finite number"),
         ("nose: {}", '"nose", expected one of noise, filters'),
         ("columns: {foo: arm.j1.position}", 'columns names "foo"'),
-        ("columns: {time: {scale: 2}}", "expected channel, and scale or offset"),
+        ("columns: {time: {scale: 2}}", "expected channel, and some of scale, offset"),
         ("columns: {time: [{}]}", r'columns, "time": got \[{}\], expected the name'),
         ("columns: {time: {channel: [t]}}", r"got \['t'\], expected the name"),
         ("columns: {time: 3}", "got 3, expected the name of a channel, or null"),
