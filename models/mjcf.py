@@ -5,6 +5,7 @@ and no reference positions. So MuJoCo compiles the file, and Drake gets one that
 only what it reads exactly: bodies, explicit inertias, joints, shapes.
 """
 
+import warnings
 from collections.abc import Container, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
@@ -16,6 +17,8 @@ import numpy as np
 from makebreak.models.activation import Activation
 from makebreak.models.effects.kind import Effect
 from makebreak.models.meshes import write_obj
+
+ENDLESS = 100.0  # [m] Of a box that stands for a plane.
 
 
 @dataclass(frozen=True)
@@ -86,6 +89,13 @@ def _name_of(spec, path: Path) -> str:
     return path.stem if name in ("", "MuJoCo Model") else name
 
 
+def compiled(spec):
+    """The model of a MjSpec, without MuJoCo's words on attributes that it will drop."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        return spec.compile()
+
+
 def _compiled(path: Path):
     """MjSpec, its compiled model, and how many collision meshes are not there."""
     try:
@@ -99,14 +109,14 @@ def _compiled(path: Path):
         spec = mujoco.MjSpec.from_file(str(path))
         left_out = _without_lost_meshes(spec, path.parent)
         try:
-            model = spec.compile()
+            model = compiled(spec)
         except ValueError:
             unreadable = _unreadable_meshes(spec, path.parent)
             if not unreadable:
                 raise
             spec = mujoco.MjSpec.from_file(str(path))
             left_out = _without_lost_meshes(spec, path.parent, unreadable)
-            model = spec.compile()
+            model = compiled(spec)
     except ValueError as error:
         raise ValueError(f"{path}: MuJoCo says: {' '.join(str(error).split())}") from (
             None
@@ -137,6 +147,29 @@ def _apply_flags(m) -> None:
         if off & int(bit) or all_of_them:
             for each in arrays:
                 each[:] = 0
+
+
+def may_touch(m) -> np.ndarray:
+    """(n, n) whether MuJoCo looks for contacts of two shapes of a compiled model: it
+    does for what is written as a pair, but else not of a link with the one that carries
+    it, nor of what is excluded or what the bits of contype and conaffinity keep
+    apart."""
+    import mujoco
+
+    bits = mujoco.mjtDisableBit
+    if m.opt.disableflags & (int(bits.mjDSBL_CONTACT) | int(bits.mjDSBL_CONSTRAINT)):
+        return np.zeros((m.ngeom, m.ngeom), dtype=bool)
+    found = (m.geom_contype[:, None] & m.geom_conaffinity[None, :]) != 0
+    found |= found.T
+    weld = m.body_weldid[m.geom_bodyid]
+    carrier = m.body_weldid[m.body_parentid[weld]]
+    carries = (carrier[:, None] == weld[None, :]) & (weld != 0)[None, :]
+    found &= ~(carries | carries.T) & (weld[:, None] != weld[None, :])
+    for pair in m.exclude_signature:
+        one, two = (m.geom_bodyid == k for k in (int(pair) >> 16, int(pair) & 0xFFFF))
+        found[np.ix_(one, two)] = found[np.ix_(two, one)] = False
+    found[m.pair_geom1, m.pair_geom2] = found[m.pair_geom2, m.pair_geom1] = True
+    return found
 
 
 def _unreadable_meshes(spec, folder: Path) -> set[str]:
@@ -213,6 +246,11 @@ class _Writer:
         self.effects: list[Effect] = []
         self.meshes: dict[int, str] = {}
         self.named: dict[tuple[str, int], str] = {}
+        self.may_touch = may_touch(model)
+        # Also what in this file touches nothing, and may touch what another has.
+        has_bits = (model.geom_contype | model.geom_conaffinity) != 0
+        self.touches = has_bits | self.may_touch.any(axis=1)
+        self.has_plane = False
         # What a motor turns along acts at the joint, by its gear squared.
         self.armature = np.array(model.dof_armature, dtype=float)
         self.damping = np.array(model.dof_damping, dtype=float)
@@ -238,7 +276,7 @@ class _Writer:
         # Each fixed shape on a body of its own: one that effects can name, and move.
         for g in range(m.body_geomnum[0]):
             at = places[0]
-            if m.geom_contype[g] or m.geom_conaffinity[g]:
+            if self.touches[g]:
                 at = ET.SubElement(places[0], "body", name=self._fixed(g))
             self._shape(g, at)
         for body in range(1, m.nbody):
@@ -257,7 +295,7 @@ class _Writer:
                 else (self.name_of("joint", j), float(m.actuator_gear[a][0]))
                 for a in range(len(m.actuator_trntype))
             ),
-            bool(np.any((m.geom_bodyid == 0) & (m.geom_contype | m.geom_conaffinity))),
+            bool(self.may_touch[m.geom_bodyid == 0].any()),
             self._frictions(),
         )  # fmt: skip
 
@@ -265,7 +303,7 @@ class _Writer:
         """Of a body's shapes the one with most friction counts."""
         m = self.m
         of: dict[tuple[int, str], tuple[int, float]] = {}  # Priority, friction.
-        for g in np.flatnonzero(m.geom_contype | m.geom_conaffinity):
+        for g in np.flatnonzero(self.touches):
             body = int(m.geom_bodyid[g])
             name = self.body_of(int(g))
             own = int(m.geom_priority[g]), float(m.geom_friction[g][0])
@@ -439,16 +477,21 @@ class _Writer:
         """Nothing for one that is for display, or of a type that is left out."""
         m = self.m
         kind = self.mj.mjtGeom(m.geom_type[g]).name[len("mjGEOM_") :].lower()
-        touches = bool(m.geom_contype[g] or m.geom_conaffinity[g])
+        touches = self.touches[g]
         if kind == "mesh":
             if not touches:
                 return  # For display alone.
             more = {"mesh": self._mesh(int(m.geom_dataid[g]))}
         elif kind in ("plane", "sphere", "capsule", "ellipsoid", "cylinder", "box"):
-            size = m.geom_size[g].copy()
-            if kind == "plane":
+            size, pos = m.geom_size[g].copy(), m.geom_pos[g].copy()
+            if kind == "plane" and touches and self.has_plane:
+                # Drake ends without a word where some of what has no end may move.
+                kind, size = "box", np.full(3, ENDLESS)
+                pos -= ENDLESS * rotation(m.geom_quat[g])[:, 2]
+            elif kind == "plane":
                 size[2] = size[2] or 1.0
-            more = {"size": _numbers(size)}
+                self.has_plane |= bool(touches)
+            more = {"size": _numbers(size), "pos": _numbers(pos)}
         else:
             if touches:
                 self.notes.append(
@@ -457,8 +500,8 @@ class _Writer:
                 )
             return
         attributes = {
-            "name": self.name_of("geom", g), "type": kind, **more, "mass": "0",
-            "pos": _numbers(m.geom_pos[g]), "quat": _numbers(m.geom_quat[g]),
+            "name": self.name_of("geom", g), "type": kind, "mass": "0",
+            "pos": _numbers(m.geom_pos[g]), **more, "quat": _numbers(m.geom_quat[g]),
             "friction": _numbers(m.geom_friction[g][:1]),
             "rgba": _numbers(m.geom_rgba[g]),
         }  # fmt: skip
@@ -479,14 +522,25 @@ class _Writer:
         return self.meshes[i]
 
     def _contact(self, root: ET.Element) -> None:
-        m = self.m
-        contact = ET.SubElement(root, "contact")
-        for pair in m.exclude_signature:
-            one, two = int(pair) >> 16, int(pair) & 0xFFFF
-            ET.SubElement(
-                contact, "exclude", body1=self.name_of("body", one),
-                body2=self.name_of("body", two),
-            )  # fmt: skip
+        """Bodies that MuJoCo has pass through each other, though both may touch others.
+        (Drake looks for no contacts of a link with the one that carries it either.)"""
+        m, contact = self.m, ET.SubElement(root, "contact")
+        of: dict[str, list[int]] = {}
+        for g in np.flatnonzero(self.touches):
+            of.setdefault(self.body_of(int(g)), []).append(int(g))
+        for (one, first), (two, second) in combinations(of.items(), 2):
+            a, b = (int(m.body_weldid[m.geom_bodyid[x[0]]]) for x in (first, second))
+            carriers = m.body_weldid[m.body_parentid[[a, b]]]
+            if a == b or a and b and (carriers[0] == b or carriers[1] == a):
+                continue
+            found = self.may_touch[np.ix_(first, second)]
+            if not found.any():
+                ET.SubElement(contact, "exclude", body1=one, body2=two)
+            elif not found.all():
+                self.notes.append(
+                    f"some shapes of {one} and {two} pass through each other by their "
+                    "contype and conaffinity, and touch here"
+                )
 
     # ----- Constraints and actuators
 

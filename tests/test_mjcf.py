@@ -287,3 +287,50 @@ def test_files_of_others_are_equal_to_mujoco(path, tmp_path):
         pytest.skip(f"{path.name} has no joints")
     _, plant = of_file(tmp_path, path)
     compare(path, plant, np.random.default_rng(1))
+
+
+@pytest.mark.parametrize(
+    ("bits", "more"),
+    [
+        ({}, ""),
+        # A robot that touches the floor and not itself, as many files have it.
+        (dict.fromkeys(("trunk", "leg", "foot", "arm"), 'contype="0"'), ""),
+        ({"floor": 'contype="2"', "foot": 'conaffinity="3"', "arm": 'contype="4"'}, ""),
+        (dict.fromkeys(("trunk", "leg", "foot", "arm"), 'contype="0" conaffinity="0"'),
+         '<contact><pair geom1="floor" geom2="foot"/><pair geom1="arm" geom2="leg"/>'
+         "</contact>"),
+        ({}, '<contact><exclude body1="foot" body2="trunk"/></contact>'),
+        ({}, '<option><flag contact="disable"/></option>'),
+    ],
+)  # fmt: skip
+def test_what_may_touch_is_what_touches_in_mujoco(tmp_path, bits, more):
+    """All shapes are in one another: what does not touch in MuJoCo may not."""
+
+    def shape(name):
+        return f'<geom name="{name}" size=".1" {bits.get(name, "")}/>'
+
+    text = (
+        f'<mujoco><worldbody><geom name="floor" type="plane" size="2 2 .1" '
+        f'{bits.get("floor", "")}/><body name="trunk"><freejoint/>{shape("trunk")}'
+        f'<body name="leg"><joint/>{shape("leg")}<body name="foot"><joint axis="1 0 0"'
+        f'/>{shape("foot")}</body></body><body name="arm"><joint/>{shape("arm")}'
+        f"</body></body></worldbody>{more}</mujoco>"
+    )
+    (tmp_path / "arm.xml").write_text(text)
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "arm.xml"))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    expected = {
+        frozenset(model.geom(g).name for g in (c.geom1, c.geom2)) for c in data.contact
+    }
+    assert len(expected) < 10  # Of five shapes.
+    (tmp_path / "scene.yaml").write_text(
+        "directives:\n- add_model: {name: arm, file: arm.xml}\n"
+    )
+    loaded = load_scene(read_scene(tmp_path / "scene.yaml"), DiagramBuilder())
+    inspector = loaded.scene_graph.model_inspector()
+    found = {
+        frozenset(inspector.GetName(g).rpartition("::")[2] for g in pair)
+        for pair in inspector.GetCollisionCandidates()
+    }
+    assert found == expected
