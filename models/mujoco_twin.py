@@ -51,7 +51,7 @@ from makebreak.models.effects.kind import (
     one_dof_joints,
 )
 from makebreak.models.effects.model_text import make_mesh_paths_absolute
-from makebreak.models.mjcf import named_spec, rotation
+from makebreak.models.mjcf import compiled, named_spec, rotation
 from makebreak.models.model_export import (
     Exported,
     JointNumbers,
@@ -67,17 +67,20 @@ from makebreak.models.scene import LoadedScene, Scene, actuators_of_model, load_
 from makebreak.models.scene_schema import COMMANDS_OF
 
 MOST_KEPT = 32  # Models.
+HELD = 1e10  # [kg m2], [kg]: what turns it is not seen to move.
 
 
 @dataclass(frozen=True, eq=False)
 class Twin:
     """model: MjModel. q (n_q,), v (n_v,): where Drake's coordinates are in qpos, qvel.
+    home (nq,): qpos, with joints that the scene holds where it has them.
     spins: of each free body where its spin is in Drake's v, and its quaternion in q.
     commands: {command channel: (entry of ctrl, factor)}."""
 
     model: Any
     q: np.ndarray
     v: np.ndarray
+    home: np.ndarray
     spins: tuple[tuple[int, int], ...]
     commands: dict[str, tuple[int, float]]
 
@@ -97,7 +100,7 @@ class MujocoTwin:
         path = (
             path_of(models[0].file, Path("/"), packages) if len(models) == 1 else None
         )
-        if path is None or path.suffix != ".xml" or scene.fixed_joints:
+        if path is None or path.suffix != ".xml":
             raise ValueError("MuJoCo simulates scenes of one MJCF file alone")
         self._spec, self._writer = named_spec(path)
         self._path = path
@@ -141,8 +144,13 @@ class MujocoTwin:
                 gaintype=mujoco.mjtGain.mjGAIN_FIXED,
                 biastype=mujoco.mjtBias.mjBIAS_AFFINE,
             )  # fmt: skip
-            drive.gainprm[0] = 1.0
-            drive.ctrllimited = 0  # Whatever the file's default is.
+            # Whatever the file's default is.
+            drive.gear, drive.gainprm[0] = [1.0, *np.zeros(5)], 1.0
+            drive.ctrllimited = drive.actlimited = 0
+            drive.dyntype = mujoco.mjtDyn.mjDYN_NONE
+            for what in ("armature", "damping", "delay"):  # Since MuJoCo 3.6 and 4.
+                if hasattr(drive, what):
+                    setattr(drive, what, np.zeros_like(getattr(drive, what))[()])
 
     def body_of(self, shape: str) -> str:
         """The name, in the file, of the body that has a shape of this name."""
@@ -174,7 +182,12 @@ class MujocoTwin:
                 raise ValueError(f"MuJoCo has no place for {e.kind}")
         spec, now = self._with_numbers(effects)
         commands = self._set_drives(spec, now.loaded, effects)
-        return _indexed(spec.compile(), now.loaded.plant, commands)
+        held = {
+            name.partition(".")[2]: q for name, q in self._file.fixed_joints.items()
+        }
+        for name in held:
+            spec.joint(name).armature = HELD
+        return _indexed(compiled(spec), now.loaded.plant, held, commands)
 
     def _with_numbers(self, effects: Sequence[Effect]):
         scene = replace(self._file, effects=list(effects))
@@ -264,12 +277,12 @@ class MujocoTwin:
 
     def _geoms_of(self, pair: str) -> list[tuple[int, int]]:
         """The geoms with which two bodies may touch."""
-        m, of = self._writer.m, dict[str, list[int]]()
-        for g in np.flatnonzero(m.geom_contype | m.geom_conaffinity):
+        of, may_touch = dict[str, list[int]](), self._writer.may_touch
+        for g in np.flatnonzero(self._writer.touches):
             of.setdefault(self._writer.body_of(int(g)), []).append(int(g))
         a, b = (name.partition(".")[2] for name in pair.split("~"))
         both = (sorted(two) for two in product(of.get(a, ()), of.get(b, ())))
-        return [(one, other) for one, other in both if _collide(m, one, other)]
+        return [(one, other) for one, other in both if may_touch[one, other]]
 
     def _set_drives(self, spec, loaded: LoadedScene, effects: Sequence[Effect]):
         act, plant = loaded.scene.actuation, loaded.plant
@@ -407,24 +420,6 @@ def _size(shape: Shape) -> np.ndarray:
     return np.zeros(0)
 
 
-def _collide(m, one: int, other: int) -> bool:
-    """Whether MuJoCo looks for contacts of two geoms: it does for what is written as
-    a pair, but else not of a link with the one that carries it, nor of what is
-    excluded or of another type."""
-    if not (m.geom_contype[one] & m.geom_conaffinity[other]
-            or m.geom_contype[other] & m.geom_conaffinity[one]):  # fmt: skip
-        return False
-    bodies = m.geom_bodyid[[one, other]]
-    if sum(int(b) << k for b, k in zip(sorted(bodies), (16, 0), strict=True)) in (
-        m.exclude_signature
-    ):
-        return False
-    a, b = welds = m.body_weldid[bodies]
-    carriers = m.body_weldid[m.body_parentid[welds]]
-    carried = 0 not in (a, b) and (carriers[0] == b or carriers[1] == a)
-    return a != b and not carried
-
-
 def _add_pair(spec, m, writer, one: int, other: int, friction: float) -> None:
     names = [writer.name_of("geom", g) for g in (one, other)]
     both = [one, other]
@@ -443,7 +438,8 @@ def _add_pair(spec, m, writer, one: int, other: int, friction: float) -> None:
     )  # fmt: skip
 
 
-def _indexed(model, plant: MultibodyPlant, commands) -> Twin:
+def _indexed(model, plant: MultibodyPlant, held, commands) -> Twin:
+    """Args: held: {joint: where}, of those that do not move."""
     q = np.full(plant.num_positions(), -1)
     v = np.full(plant.num_velocities(), -1)
     spins = []
@@ -464,4 +460,7 @@ def _indexed(model, plant: MultibodyPlant, commands) -> Twin:
         spins.append((int(turn), int(first)))
     if (q < 0).any() or (v < 0).any():
         raise ValueError("MuJoCo's model has other joints than the scene")
-    return Twin(model, q, v, tuple(spins), commands)
+    home = np.array(model.qpos0)
+    for name, at in held.items():
+        home[model.joint(name).qposadr[0]] = at
+    return Twin(model, q, v, home, tuple(spins), commands)

@@ -14,8 +14,8 @@ from makebreak.models.scene import InitialSection, read_scene  # noqa: E402
 
 FILE = """
 <mujoco model="w"><option timestep="0.001" integrator="implicitfast"/>
-<default><geom condim="4"/><position ctrlrange="-1 1"/><general ctrlrange="-1 1"/>
-</default><worldbody>
+<default><geom condim="4"/><general ctrlrange="-1 1" gear="5" dyntype="filter"
+ dynprm="0.3"/></default><worldbody>
 <geom name="floor" type="plane" size="3 3 .1" friction="{floor}"/>
 <geom name="a_wall" type="box" size=".02 .5 .2" pos="{wall} 0 .2" euler="0 0 10"/>
 <body name="pusher" pos="0 0 .05"><joint name="px" type="slide" axis="1 0 0"
@@ -26,7 +26,8 @@ FILE = """
 </body><body name="arm" pos="0 -1 .3"><joint name="turn" axis="0 1 0" damping=".01"/>
  <inertial pos="{centre} 0 0" mass="{arm}" diaginertia=".002 .004 .003"/></body>
 </worldbody>
-<actuator><position joint="px" kp="{kp}" kv="30" forcerange="-40 40"/></actuator>
+<actuator><position joint="px" kp="{kp}" kv="30" forcerange="-40 40" gear="1"
+ timeconst="0"/></actuator>
 </mujoco>"""
 PLAIN = {
     "floor": 0.4, "wall": 0.4, "damping": 8.0, "rotor": 0.1, "dry": 0.2, "tip": 0.3,
@@ -35,24 +36,27 @@ PLAIN = {
 START = [0.0, 0.12, 0.01, 0.04, 1.0, 0.0, 0.0, 0.0, 0.0]
 
 
-def own(**changes) -> np.ndarray:
+def own(**changes) -> tuple[np.ndarray, np.ndarray]:
     """(n, 9) qpos every 10 ms of 0.8 s in which the box is pushed against the wall, and
-    an arm swings."""
+    an arm swings; and (8,) the mean rate about the start, of the steps before and after
+    it."""
     model = mujoco.MjModel.from_xml_string(FILE.format(**PLAIN | changes))
     data = mujoco.MjData(model)
     data.qpos[:] = START
     data.qvel[:] = [0.1, 0.0, 0.2, 0.0, 0.1, 0.2, 1.0, 0.0]
-    rows = []
+    rows, rate = [], 0.5 * data.qvel
     for step in range(800):
         data.ctrl[:] = 0.3 * np.floor(step / 20) * 20 / 400
         mujoco.mj_step(model, data)
+        rate = rate + 0.5 * data.qvel if step == 0 else rate
         if step % 10 == 9:
             rows.append(np.array(data.qpos))
-    return np.array(rows)
+    return np.array(rows), rate
 
 
-def simulated(folder, *effects: Effect, noted: dict | None = None) -> np.ndarray:
-    """The same by a scene. noted: the pairs that touch are added to it."""
+def simulated(folder, rate, *effects: Effect, noted: dict | None = None) -> np.ndarray:
+    """The same by a scene. rate (8,): at the start, of qvel's order. noted: the pairs
+    that touch are added to it."""
     (folder / "w.xml").write_text(FILE.format(**PLAIN))
     (folder / "scene.yaml").write_text(
         "directives:\n- add_model: {name: w, file: w.xml}\n"
@@ -64,8 +68,9 @@ def simulated(folder, *effects: Effect, noted: dict | None = None) -> np.ndarray
     simulation.set_effects([*simulation.scene.effects, *effects])
     # In the world: the box begins level, so its own axes are the world's.
     initial = InitialSection(
-        {"w.px": 0.0}, {"w.px": 0.1}, {"w.box": [1.0, 0, 0, 0, *START[1:4]]},
-        {"w.box": [0.1, 0.2, 1.0, 0.0, 0.2, 0.0]},
+        {"w.px": 0.0}, {"w.px": rate[0], "w.turn": rate[7]},
+        {"w.box": [1.0, 0, 0, 0, *START[1:4]]},
+        {"w.box": [*rate[4:7], *rate[1:4]]},
     )  # fmt: skip
     time = 0.02 * np.arange(40)
     commands = Commands(time, {"w.px.position_command": 0.3 * time / 0.4})
@@ -120,12 +125,12 @@ def simulated(folder, *effects: Effect, noted: dict | None = None) -> np.ndarray
 )
 def test_effects_are_what_the_same_change_of_the_file_is(tmp_path, changes, effects):
     each = [Effect(kind, at.split(), parameters) for kind, at, parameters in effects]
-    expected = own(**changes)
+    expected, rate = own(**changes)
     if changes:
-        assert np.abs(expected - own()).max() > 1e-3  # It shows.
+        assert np.abs(expected - own()[0]).max() > 1e-3  # It shows.
     same = slice(70)  # Later the last digit grows, between the pusher and the wall.
     np.testing.assert_allclose(
-        simulated(tmp_path, *each)[same], expected[same], atol=1e-7
+        simulated(tmp_path, rate, *each)[same], expected[same], atol=1e-7
     )
 
 
@@ -136,7 +141,7 @@ def test_pairs_that_touch_are_those_of_mujoco(tmp_path, wall, monkeypatch):
     model = mujoco.MjModel.from_xml_string(FILE.format(**PLAIN))
     data = mujoco.MjData(model)
     expected, names = {}, ["floor", "a_wall", "pusher", "box"]
-    for qpos in own():
+    for qpos in own()[0]:
         data.qpos[:] = qpos
         mujoco.mj_kinematics(model, data)
         mujoco.mj_collision(model, data)
@@ -146,7 +151,7 @@ def test_pairs_that_touch_are_those_of_mujoco(tmp_path, wall, monkeypatch):
             ): pytest.approx(c.friction[0])
             for c in data.contact
         }
-    simulated(tmp_path, noted=(noted := {}))
+    simulated(tmp_path, own()[1], noted=(noted := {}))
     order = {"w.box~w.pusher": "w.box~w.pusher", "w.pusher~w.box": "w.box~w.pusher"}
     assert {order.get(at, at): mu for at, mu in noted.items()} == expected
     assert ("w.box~w.a_wall" in noted) == (wall == 0.4)
@@ -155,7 +160,7 @@ def test_pairs_that_touch_are_those_of_mujoco(tmp_path, wall, monkeypatch):
 def test_what_mujoco_has_no_place_for_is_refused(tmp_path):
     with pytest.raises(ValueError, match="no place for contact_stiffness"):
         effect = Effect("contact_stiffness", ["w.box~w.floor"], {"stiffness": 1e4})
-        simulated(tmp_path, effect)
+        simulated(tmp_path, np.zeros(8), effect)
     (tmp_path / "other.yaml").write_text(
         "directives:\n- add_model: {name: ball, file: package://makebreak/models/"
         "ball.sdf}\n"
@@ -185,3 +190,50 @@ def test_a_pair_is_only_of_what_mujoco_lets_touch(tmp_path, more):
     scene = read_scene(tmp_path / "scene.yaml")
     made = MujocoTwin(scene).with_effects(scene.effects).model
     assert made.npair == (1 if more else 2)
+
+
+ARM = """<mujoco model="a"><option timestep="0.01" integrator="{integrator}"/>
+<worldbody><body name="upper">
+<joint name="j1" axis="0 1 0" damping=".3"/>
+<inertial pos="0.1 0 -.2" mass="1" diaginertia=".01 .01 .002"/>{fore}</body>
+</worldbody><actuator><motor joint="j1"/></actuator></mujoco>"""
+FORE = """<body name="fore" pos="0 0 -.3" {turned}>{joint}
+<inertial pos="0 .1 -.12" mass=".8" diaginertia=".006 .005 .002"/></body>"""
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast", "RK4"])
+def test_a_log_of_mujocos_steps_is_what_its_windows_show(tmp_path, integrator):
+    """A joint is held where the scene has it fixed."""
+    joint = '<joint name="j2" axis="1 0 0" damping=".1"/>'
+    held = ARM.format(
+        fore=FORE.format(turned='euler="30 0 0"', joint=""), integrator=integrator
+    )
+    free = ARM.format(fore=FORE.format(turned="", joint=joint), integrator=integrator)
+    (tmp_path / "a.xml").write_text(free)
+    (tmp_path / "scene.yaml").write_text(
+        "directives:\n- add_model: {name: a, file: a.xml}\n"
+        "fixed_joints: {a.j2: 0.5235987755982988}\n"
+        "actuation: {type: effort, joints: [a.j1]}\n"
+    )
+    model = mujoco.MjModel.from_xml_string(held)
+    data = mujoco.MjData(model)
+    rows = []
+    time = 0.01 * np.arange(120)
+    u = 9.0 * np.sin(6.0 * time)
+    for now in u:
+        rows.append([data.qpos[0], data.qvel[0]])
+        data.ctrl[:] = now
+        mujoco.mj_step(model, data)
+    (q, v), k = np.array(rows).T, 7
+    mean = v[k] if integrator == "RK4" else 0.5 * (v[k] + v[k + 1])
+    # Between steps positions go in lines, at the velocity that the step ends with.
+    stamps = np.sort(np.r_[time[k:], time[k:-1] + 0.0025])
+    path = MujocoSimulation(read_scene(tmp_path / "scene.yaml")).run(
+        InitialSection({"a.j1": q[k]}, {"a.j1": mean}), stamps,
+        ["a.j1.position", "a.j1.velocity"], Commands(time, {"a.j1.effort_command": u}),
+    )  # fmt: skip
+    np.testing.assert_allclose(path[::2], np.array(rows)[k:], atol=1e-6)
+    if integrator != "RK4":
+        np.testing.assert_allclose(path[1::2, 1], v[k + 1 :], atol=1e-6)
+        rate = np.diff(path[:, 0])[::2] / 0.0025
+        np.testing.assert_allclose(rate, v[k + 1 :], atol=1e-4)

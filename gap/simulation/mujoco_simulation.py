@@ -1,19 +1,27 @@
 """Windows of recordings simulated by MuJoCo, with the contact of the model's file."""
 
-from collections.abc import Iterator, Mapping, Sequence
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from contextvars import copy_context
+from threading import Lock
+from typing import TypeVar
 
 import numpy as np
 
 from makebreak.gap.budget import go_on
 from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.simulation.scene_simulation import SceneSimulation
-from makebreak.gap.simulation.sensor_samples import between
+from makebreak.gap.simulation.sensor_samples import SAME_SEC, between
 from makebreak.models.effects.kind import Effect, full_name, model_names
 from makebreak.models.mujoco_twin import MujocoTwin
 from makebreak.models.scene import InitialSection, Scene
 
+T = TypeVar("T")
+
 NOTED = 5  # Steps.
+ROUNDS, EXACT = 25, 1e-10  # In which a start's velocities are found, and how well.
 
 
 class MujocoSimulation(SceneSimulation):
@@ -29,7 +37,9 @@ class MujocoSimulation(SceneSimulation):
         except ValueError as error:
             raise DoesNotFit(str(error)) from None
         super().__init__(scene)
+        _say_nothing_of_what_grows()
         self._met: dict[str, float] | None = None
+        self._lock = Lock()
         self.set_effects(scene.effects)
 
     def set_effects(self, effects: Sequence[Effect]) -> None:
@@ -37,6 +47,30 @@ class MujocoSimulation(SceneSimulation):
         self._twin = self._twins.with_effects(effects)
         self._current = tuple(effects)
         self._commands.set_effects(self._current)
+
+    def each(self, calls: Sequence[Callable[[], T]]) -> list[T]:
+        """In threads, of which one at a time does anything but MuJoCo's steps."""
+
+        def in_turn(call: Callable[[], T]) -> T:
+            with self._lock:
+                return call()
+
+        # No longer than the calls: a process that is copied copies no threads.
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            done = [pool.submit(copy_context().run, in_turn, call) for call in calls]
+            return [each.result() for each in done]
+
+    @contextmanager
+    def _lent(self) -> Iterator[None]:
+        """Meanwhile another thread may have its turn."""
+        if not self._lock.locked():  # There is one thread.
+            yield
+            return
+        self._lock.release()
+        try:
+            yield
+        finally:
+            self._lock.acquire()
 
     @contextmanager
     def noting_pairs(self) -> Iterator[dict[str, float]]:
@@ -96,6 +130,7 @@ class MujocoSimulation(SceneSimulation):
         twin, n_q = self._twin, self._plant.num_positions()
         model, dt = twin.model, self._twin.model.opt.timestep
         data = mujoco.MjData(model)
+        data.qpos[:] = twin.home
         data.qpos[twin.q] = x[:n_q]
         data.qvel[twin.v] = x[n_q:]
         for spin, quat in twin.spins:
@@ -111,10 +146,15 @@ class MujocoSimulation(SceneSimulation):
             if channel in twin.commands:
                 k, factor = twin.commands[channel]
                 control[:, k] += factor * values
+        ahead = model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4
+        if ahead:
+            _begin_half_a_step_before(model, data, control[0])
         spec = mujoco.mjtState.mjSTATE_FULLPHYSICS
         first = np.zeros(mujoco.mj_stateSize(model, spec))
         mujoco.mj_getState(model, data, first, spec)
-        states, _ = rollout(model, data, first[None], control[None], nstep=n)
+        with self._lent():
+            states, _ = rollout(model, data, first[None], control[None], nstep=n)
+        self.failure = ""
         every = np.vstack([first, states[0]])[:, 1:]
         if self._met is not None:
             self._note_pairs(self._met, every)
@@ -128,4 +168,40 @@ class MujocoSimulation(SceneSimulation):
             path[:, n_q + spin : n_q + spin + 3] = own + 2.0 * np.cross(
                 u, np.cross(u, own) + w * own
             )
-        return between(time, path, needed), {}
+        x = between(time, path, needed)
+        if ahead:  # Velocities are the rates of positions, which go in lines.
+            step = np.searchsorted(time, needed - SAME_SEC)
+            x[:, n_q:] = path[np.minimum(step, n), n_q:]
+        return x, {}
+
+
+def _begin_half_a_step_before(model, data, control: np.ndarray) -> None:
+    """Sets the velocities that MuJoCo, which steps them before positions, has where a
+    motion has those of `data`: the mean of those before and after.
+
+    Args: control (n_u,): of the first step.
+    """
+    import mujoco
+
+    given = data.qvel.copy()
+    next_one = mujoco.MjData(model)
+    for _ in range(ROUNDS):
+        next_one.qpos[:], next_one.qvel[:] = data.qpos, data.qvel
+        next_one.ctrl[:] = control
+        mujoco.mj_step(model, next_one)
+        more = 0.5 * (next_one.qvel - data.qvel)
+        if not np.isfinite(more).all():
+            return
+        change = np.abs(given - more - data.qvel).max(initial=0.0)
+        data.qvel[:] = given - more
+        if change < EXACT:
+            return
+
+
+def _say_nothing_of_what_grows() -> None:
+    """What is tried may be unstable, which MuJoCo would write into a file beside the
+    user's, and onto the screen."""
+    import mujoco
+
+    if getattr(mujoco, "get_mju_user_warning", lambda: True)() is None:
+        mujoco.set_mju_user_warning(lambda text: None)

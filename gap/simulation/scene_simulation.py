@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from pydrake.geometry import SceneGraph, Sphere
@@ -31,6 +32,8 @@ from makebreak.models.effects.kind import Effect
 from makebreak.models.effects.measured_channels import ChannelMap, channel_maps
 from makebreak.models.scene import CHANNEL_STEPS, InitialSection, Scene, read_scene
 from makebreak.systems.numerics.filters import Stage
+
+T = TypeVar("T")
 
 FREE_STEPS = 2000  # Of a continuous run, before short steps end it.
 STEPS_BETWEEN = 200  # Before it is asked again whether to go on.
@@ -220,6 +223,10 @@ class SceneSimulation:
             m = maps.get(channel)
             out[:, i] = column if m is None else m.scale * column + m.bias
         return out
+
+    def each(self, calls: Sequence[Callable[[], T]]) -> list[T]:
+        """The results of calls each of which runs this once."""
+        return [call() for call in calls]
 
     # ----- Building
 

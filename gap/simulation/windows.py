@@ -8,6 +8,7 @@ by their block of time before anything is fitted.
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -630,11 +631,8 @@ class WindowModel(WindowedResidual):
         self.simulation.set_effects(every)
         commands = self.commands(every)
         self.runs += 1
-        out = []
-        for k, w in enumerate(self.windows):
-            if chosen is not None and not chosen[k]:
-                out.append(np.zeros((0, len(self.channels))))
-                continue
+
+        def of(w: Window) -> np.ndarray:
             recording = self.recordings[w.recording]
             episode = recording.episode_at(w.rows.start)
             y = self.simulation.run(
@@ -650,8 +648,15 @@ class WindowModel(WindowedResidual):
             )
             if self.simulation.failure:
                 y[np.isnan(y)] = np.inf
-            out.append(y)
-        return out
+            return y
+
+        none = np.zeros((0, len(self.channels)))
+        some = [w for k, w in enumerate(self.windows) if chosen is None or chosen[k]]
+        done = iter(self.simulation.each([partial(of, w) for w in some]))
+        return [
+            next(done) if chosen is None or chosen[k] else none
+            for k in range(len(self.windows))
+        ]
 
     def _before(self, w: Window, episode: Episode, effects):
         """{channel: (times, true values)} of what filters remember."""
