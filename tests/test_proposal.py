@@ -5,6 +5,7 @@ from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
+import yaml
 from gap_benchmark.cases import cases, make
 from pydrake.systems.framework import DiagramBuilder
 
@@ -943,3 +944,46 @@ def test_a_limit_that_measured_efforts_are_beyond_is_no_limit(tmp_path, own):
     most = 3.0 * np.abs(2.0 * np.cos(2.0 * t) + 1.4 * np.cos(7.0 * t)).max()
     assert limit_of(2.0 * most) == [2.0 * most]
     assert limit_of(0.5 * most) == [1e9]
+
+
+@pytest.mark.parametrize(
+    ("lag", "says", "declared"),
+    [
+        (0.005, "5 +-", {"r.j1.velocity": "backward difference"}),
+        (0.02, "20 +-", {"r.j1.velocity": "delay, 20 ms"}),
+        (-0.02, "before position", {"r.j1.position": "delay, 20 ms"}),
+        (0.0005, "", {}),
+    ],
+)
+@pytest.mark.parametrize("own", ["", "filters: {r.j1.velocity: none}\n"])
+def test_a_velocity_that_is_late_is_declared_so(tmp_path, lag, says, declared, own):
+    """Of a log alone: two of its columns tell it. What its sidecar says stays."""
+    t, rng = np.arange(0.0, 12.0, 0.01), np.random.default_rng(3)
+    (tmp_path / "r.urdf").write_text(
+        '<robot name="r"><link name="base"/><link name="bar"><inertial><mass value="1"'
+        '/><origin xyz="0 0 -.3"/><inertia ixx=".1" iyy=".1" izz=".1" ixy="0" ixz="0" '
+        'iyz="0"/></inertial></link><joint name="j1" type="continuous"><parent '
+        'link="base"/><child link="bar"/><axis xyz="0 1 0"/></joint></robot>'
+    )
+
+    def wave(t, rate=False):
+        each = [(1.1, 3.0, 0.2), (0.6, 7.3, 1.0), (0.3, 11.9, 0.4)]
+        if rate:
+            return sum(a * w * np.cos(w * t + p) for a, w, p in each)
+        return sum(a * np.sin(w * t + p) for a, w, p in each)
+
+    noise = rng.normal(size=(2, len(t)))
+    rows = [t, wave(t) + 1e-4 * noise[0], wave(t - lag, True) + 2e-3 * noise[1]]
+    header = "time,j1_position,j1_velocity"
+    path = tmp_path / "log.csv"
+    np.savetxt(path, np.transpose(rows), delimiter=",", header=header, comments="")
+    if own:
+        (tmp_path / "log.yaml").write_text(own)
+    log = read_log(path)
+    proposal = propose_scene(read_robot(tmp_path / "r.urdf"), [log])
+    filters = yaml.safe_load(proposal.sidecars[path]).get("filters") or {}
+    told = [each.says for each in proposal.said if each.kind == "velocity_lag"]
+    if own or not says:
+        assert not told and filters == ({"r.j1.velocity": "none"} if own else {})
+    else:
+        assert filters == declared and says in told[0]

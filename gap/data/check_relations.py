@@ -1,6 +1,6 @@
 """How channels of a recording relate to each other where they measure one motion."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
@@ -50,7 +50,7 @@ def check_relations(recording: Recording, told: Collection[str]) -> list[Finding
 def _velocity_findings(
     recording: Recording, name: str, relation: Relation | None
 ) -> list[Finding]:
-    if relation is None or relation.residual > 0.3 * relation.signal:
+    if relation is None or not is_rate(relation):
         return []
     found, r = [], relation
     filters = recording.channels[name].stages
@@ -82,26 +82,44 @@ def _velocity_findings(
         way = "high" if r.bias > 0.0 else "low"
         says = f"{name} reads {abs(r.bias):.3g} {unit} too {way}, by its integral."
         add("velocity_bias", r.bias, unit, "warning", says)
-    longest = longest_sec(recording)
-    if abs(r.skew) > max(SURE * r.skew_std, 2e-5, 0.15 * r.period / longest):
+    if run_apart(r, longest_sec(recording)):
         late = "later" if r.skew > 0.0 else "earlier"
         says = (
             f"{name} comes {late} by {abs(r.skew) * 1e3:.3g} ms each second than "
             "position: their clocks run apart."
         )
         add("clock_skew", r.skew, "s/s", "warning", says)
-    elif abs(r.lag) > max(SURE * r.lag_std, 0.15 * r.period):
-        late = "after" if r.lag > 0 else "before"
-        says = (
-            f"{name} comes {abs(r.lag) * 1e3:.3g} +- {r.lag_std * 1e3:.2g} ms {late} "
-            "position"
-        )
-        half = abs(r.lag / r.period - 0.5) < 0.1
-        if filters:
-            says += ", beyond its declared filter"
-        says += ", as a backward difference of it would." if half else "."
+    elif is_late(r):
+        says = says_late([name], r, ", beyond its declared filter" if filters else "")
         add("velocity_lag", r.lag, "s", "warning", says)
     return found
+
+
+def is_rate(r: Relation) -> bool:
+    """Whether a velocity follows from its position."""
+    return not r.residual > 0.3 * r.signal
+
+
+def run_apart(r: Relation, longest: float) -> bool:
+    """Whether the clocks of a velocity and its position do, over so long [s]."""
+    return abs(r.skew) > max(SURE * r.skew_std, 2e-5, 0.15 * r.period / longest)
+
+
+def is_late(r: Relation) -> bool:
+    """Whether a velocity comes later or earlier than its position beyond doubt."""
+    return abs(r.lag) > max(SURE * r.lag_std, 0.15 * r.period)
+
+
+def says_late(names: Sequence[str], r: Relation, beyond: str = "") -> str:
+    """A sentence for velocities that are late. r: of the first; beyond: what is
+    declared already."""
+    late = "after" if r.lag > 0.0 else "before"
+    comes, it = ("come", "them") if len(names) > 1 else ("comes", "it")
+    as_what = f", as a backward difference of {it} would" if r.of_a_difference() else ""
+    return (
+        f"{', '.join(names)} {comes} {abs(r.lag) * 1e3:.3g} +- {r.lag_std * 1e3:.2g} ms"
+        f" {late} position{beyond}{as_what}."
+    )
 
 
 def _spin_findings(recording: Recording, at: str) -> list[Finding]:
@@ -127,7 +145,7 @@ def _spin_findings(recording: Recording, at: str) -> list[Finding]:
                 left[frame] += float(np.sum(wrong**2))
             stages = recording.channels[name].stages or ()
             behind = filtered(stages, middle, world[:, j])
-            relation = relate(t_w, w, middle, behind, width=_width(len(t)))
+            relation = relate(t_w, w, middle, behind, width=width_of(len(t)))
             if relation is not None:
                 parts.append(relation)
         found += _velocity_findings(recording, name, _together(parts))
@@ -210,7 +228,7 @@ def _ceiling_of_measured(
     return None
 
 
-def _width(n: int) -> float:
+def width_of(n: int) -> float:
     """Of the Gaussian [samples]: narrow where an episode is short."""
     return 3.0 if n > 300 else 1.5
 
@@ -224,7 +242,7 @@ def _related(
         t_x, values_x = recording.samples(x, episode)
         if min(len(t_y), len(t_x)) < 20:
             continue
-        width = _width(min(len(t_y), len(t_x)))
+        width = width_of(min(len(t_y), len(t_x)))
         if not held:
             # Each behind the other's declared filters: they then have the same ones.
             values_y, values_x = (

@@ -29,7 +29,7 @@ class Match:
     it is left out. why: a few words. may: the channel that one that is left out would
     be, were another column not. told: of its unit, what its name does not say.
     activation: of a command that its drive does not follow as it is; clock: the time's
-    match, that it goes by."""
+    match, that it goes by; filter: of the channel, for the sidecar."""
 
     column: str
     channel: str | None
@@ -40,6 +40,7 @@ class Match:
     told: str = ""
     activation: Activation | None = None
     clock: "Match | None" = None
+    filter: str = ""
 
     def values(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
         """(n,) of the channel, in its unit."""

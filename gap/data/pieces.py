@@ -33,6 +33,8 @@ def excerpt(
     Pieces are of 12 s or 20 000 rows, or whole episodes where these are shorter, evenly
     spread. Noise and notes are those of the whole.
     """
+    if not recordings:
+        return []
     seconds = sum(r.duration_sec() for r in recordings)
     share = min(
         most_sec / max(seconds, 1e-9), most_rows / sum(len(r.time) for r in recordings)

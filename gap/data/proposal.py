@@ -182,8 +182,10 @@ def _kinds(matches: Sequence[Match]) -> list[str]:
 
 def sidecar_text(matches: Sequence[Match], own: Mapping | None = None) -> str:
     """A sidecar with the columns, to be corrected. own: sections of the log's own, of
-    which all but the columns are kept."""
+    which all but the columns are kept, and filters that matches tell of are added."""
     rest = {key: value for key, value in (own or {}).items() if key != "columns"}
+    if filters := {m.channel: m.filter for m in matches if m.filter}:
+        rest["filters"] = {**filters, **(rest.get("filters") or {})}
     lines = ["# What each column is: a proposal, to be corrected. docs/recordings.md",
              "columns:"]  # fmt: skip
     for match in matches:

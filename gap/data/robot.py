@@ -41,6 +41,7 @@ from makebreak.gap.data.findings import (
     Finding,
 )
 from makebreak.gap.data.joined import read_joined
+from makebreak.gap.data.late_velocities import with_late_velocities
 from makebreak.gap.data.match import AS_SAID, JointName, Match
 from makebreak.gap.data.nameless import BY_CONTENT, layouts
 from makebreak.gap.data.own_contacts import overlapping
@@ -504,6 +505,11 @@ def judge_logs(robot: Robot, logs: Sequence[Log]) -> Judged:
     given = [f"{joint}.effort_measured" for joint in servos]
     unexplained = any(each.kind == UNEXPLAINED for each in said)
     every = {path: of_one_drive(own, given, unexplained) for path, own in every.items()}
+    for log in logs:
+        every[log.path], late = with_late_velocities(
+            log.table.columns, every[log.path], log.own.get("filters") or {}
+        )
+        said += [Said("velocity_lag", *each) for each in late]
     return Judged(
         robot, every, fixed, tuple(unused), tuple(said), servos, in_lines, most
     )

@@ -35,6 +35,10 @@ class Relation:
     signal: float  # rms of the smoothed y about its mean.
     period: float  # [s] of the clock.
 
+    def of_a_difference(self) -> bool:
+        """Whether y is as late as a backward difference of x."""
+        return abs(self.lag / self.period - 0.5) < 0.1
+
 
 def relate(t_y, y, t_x, x, order=0, held=False, longest_lag=0.3, width=3.0):
     """The relation of y to the order-th derivative of x; None if it cannot be told.
