@@ -81,7 +81,8 @@ class NamedEffect:
 
     indistinguishable_from: others that explain these data as well, with the parameters
     that they would have. identifiable: "identifiable", "weak" or "not". recordings: in
-    which it is, where it is not in all of them.
+    which it is, where it is not in all of them. sliding: which of these others' joints
+    slide.
     """
 
     kind: str
@@ -93,6 +94,7 @@ class NamedEffect:
     tell_apart: str = ""
     identifiable: str = "identifiable"
     recordings: tuple[str, ...] = ()
+    sliding: frozenset[str] = frozenset()
 
     def effect(self) -> Effect:
         """As a scene file lists it."""

@@ -330,6 +330,8 @@ def named(choice: Choice, plant: MultibodyPlant, beside: str = "") -> NamedEffec
         choice.ties,
         apart if choice.ties else "",
         "weak" if weak else "identifiable",
+        sliding=frozenset(at for tie in choice.ties for at in tie.at)
+        & sliding_joints(plant),
     )
 
 

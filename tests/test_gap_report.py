@@ -433,6 +433,17 @@ def test_a_tie_is_said_with_what_tells_it_apart(case, tmp_path):
     )
 
 
+def test_a_tie_at_a_joint_that_slides_is_in_its_units(case, tmp_path):
+    effect = replace(
+        case[2].effects[0], indistinguishable_from=(VISCOUS,),
+        sliding=frozenset(VISCOUS.at),
+    )  # fmt: skip
+    result = replace(case[2], verdict="ambiguous", effects=[effect])
+    says = "p.j1 has 0.2 N s/m of viscous damping"
+    assert says in text_of(written(case, tmp_path, result))
+    assert any(says in line for line in summary_lines(result))
+
+
 def test_a_runner_up_that_is_ahead_is_said_to_be(case, tmp_path):
     """A bigger model that is not enough better to be taken."""
     evidence = replace(case[2].effects[0].evidence, margin=-0.08)

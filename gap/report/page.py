@@ -138,8 +138,8 @@ def _ties(each: NamedEffect) -> str:
     if not each.indistinguishable_from:
         return ""
     others = "".join(
-        f"<li>{sentence_html(other)}</li>"
-        for other in map(says_of, each.indistinguishable_from)
+        f"<li>{sentence_html(says_of(other, each.sliding))}</li>"
+        for other in each.indistinguishable_from
     )
     tell = f"<p><b>To distinguish them:</b> {sentence_html(each.tell_apart)}</p>"
     return (

@@ -1,6 +1,6 @@
 """What a result says in lines of text, for the command line and the page."""
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 
 import numpy as np
 
@@ -40,7 +40,7 @@ def summary_lines(result: GapResult) -> list[str]:
             lines.append(f"  {said}")
     for each in result.effects:
         for other in each.indistinguishable_from:
-            lines.append(f"    or: {says_of(other)}")
+            lines.append(f"    or: {says_of(other, each.sliding)}")
         if each.tell_apart:
             lines.append(f"    to distinguish them: {each.tell_apart}")
     for none in result.tried:
@@ -97,9 +97,10 @@ def windows_of(result: GapResult) -> str:
     return f"simulated windows of {number(seconds)} s" if seconds > 0.0 else "samples"
 
 
-def says_of(effect: Effect) -> str:
-    """The sentence of an effect without deviations."""
-    return sentence(effect, KINDS[effect.kind])
+def says_of(effect: Effect, sliding: Set[str] = frozenset()) -> str:
+    """The sentence of an effect without deviations. sliding: joints that slide."""
+    slides = bool(effect.at) and sliding >= {*effect.at}
+    return sentence(effect, KINDS[effect.kind], slides=slides)
 
 
 def closed_share(before: float, after: float, floor: float) -> str:
