@@ -38,6 +38,9 @@ from makebreak.gap.verdict import closed_at
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
 
+# Windows in which nothing moves differ by less, and say nothing.
+ROUNDING = 1e-6
+
 Judge = Callable[[Selection], Outcome | None]
 Veto = tuple[Choice, str]  # And why, as a sentence.
 
@@ -314,7 +317,7 @@ def is_confirmed(gap: GapMeasure, acts_at: Callable[[str], bool]) -> bool:
     these say the same of what shows in them."""
     if gap.before > AGREEMENT_RMS_MAX:
         return closed_at(gap, acts_at) >= CLOSED_SHARE_MIN
-    worse = gap.after > gap.before
+    worse = gap.after > (1.0 + ROUNDING) * gap.before
     if worse and (gap.in_equations is None or gap.reduction_in_equations <= 0.0):
         return False
     return gap.after <= AGREEMENT_RMS_MAX and _equations_confirm(gap)

@@ -114,6 +114,7 @@ def test_recordings_that_are_too_short_tell_nothing(pushes):
     [
         ((0.9, 0.8), None, True),
         ((0.8, 0.8), None, True),  # A sensor's bias.
+        ((0.8, 0.8 + 1e-8), None, True),  # All is at rest.
         ((0.8, 0.81), None, False),
         ((0.8, 0.81), (1.2, 1.2), False),
         ((0.8, 0.81), (9.0, 1.1), True),
