@@ -211,6 +211,7 @@ def _run(
     recordings = of_loops(as_used(recordings, dynamics))
     if scene.actuation.hold == "first_order":
         recordings = [in_lines(r) for r in recordings]
+    whole = recordings
     recordings, stops = without_stops(recordings, scene_facts(dynamics.plant))
     checks += stops
     check_initial_names(scene, recordings)
@@ -218,6 +219,7 @@ def _run(
     check_meshes(dynamics.loaded, recordings)
     # What is reported on is cut off before anything is looked at.
     parts = split(recordings)
+    given, as_read = scene, parts
     say("checking the recordings")
     go_on()
     checks += check_recordings(parts.decided, scene_facts(dynamics.plant))
@@ -238,9 +240,41 @@ def _run(
     if len(limbs) > 1 and any(r.commands() for r in parts.decided):
         scene, parts, found = _with_commands_of_most(scene, parts, limbs, jobs)
         checks += found
+
+    known = list(checks)
+
+    def in_mujoco(*some: Split) -> GapResult | None:
+        """What a scene comes to whose world may be MuJoCo's: its steps, contacts and
+        water; and its stops, if too little is without them."""
+        for each in some:
+            decided, reported, done = _conditioned(each, dynamics, False)
+            reported = excerpt(reported, REPORTED_SEC, REPORTED_ROWS)
+            told = [c for c in known if each is as_read or c not in stops] + done
+            ask = partial(_in_mujoco, given, decided, reported, told, jobs, say)
+            with budget.share(1.5).running() as own:
+                found = own.if_time("simulating windows with MuJoCo", ask, None)
+            seconds["MuJoCo"] = seconds.get("MuJoCo", 0.0) + clock.lap()
+            if found is not None:
+                return unless_doubtful(found).with_seconds(seconds)
+        return None
+
+    def unless_in_mujoco(result: GapResult) -> GapResult:
+        """Where nothing else explains what a robot does."""
+        result = replace(result, seconds={**seconds, **result.seconds})
+        if not is_mechanism or result.verdict not in ("gap_unnamed", "not_judged"):
+            return result
+        clock.lap()
+        tried = (as_read,) if not meets else ()
+        return in_mujoco(*tried, *([split(whole)] if stops else [])) or result
+
+    if meets or not is_mechanism:
+        result = in_mujoco(as_read)
+        if result is not None:
+            return result
     if len(limbs) < 2:
-        result = _compared(scene, dynamics, parts, meets, checks, jobs, say, clock)
-        return replace(result, seconds={**seconds, **result.seconds})
+        return unless_in_mujoco(
+            _compared(scene, dynamics, parts, meets, checks, jobs, say, clock)
+        )
 
     def of_limb(k: int) -> GapResult:
         of_scene, of_parts = only(limbs[k], scene, parts)
@@ -278,7 +312,7 @@ def _run(
     result = joined(limbs, results)
     for what in result.unfinished:
         budget.leave(what)
-    return replace(result, seconds={**seconds, **result.seconds})
+    return unless_in_mujoco(result)
 
 
 def _compared(
@@ -299,16 +333,8 @@ def _compared(
     budget, seconds = present(), {}
     is_mechanism = _is_mechanism(dynamics, parts.decided)
     decided, reported, done = _conditioned(parts, dynamics, is_mechanism and not meets)
-    reported = excerpt(reported, REPORTED_SEC, REPORTED_ROWS) if reported else []
+    reported = excerpt(reported, REPORTED_SEC, REPORTED_ROWS)
     say("preparing motions and windows")
-    if not is_mechanism:
-        ask = partial(_in_mujoco, scene, decided, reported, [*checks, *done], jobs, say)
-        with budget.share(1.5).running() as own:
-            by_mujoco = own.if_time("simulating windows with MuJoCo", ask, None)
-        seconds["MuJoCo"] = clock.lap()
-        if by_mujoco is not None:
-            return unless_doubtful(by_mujoco).with_seconds(seconds)
-        say("preparing motions and windows")
     if is_mechanism and not meets:
         scene = without_shapes(scene)
     problem, found = problem_for(scene, decided, dynamics, jobs, meets)
@@ -635,6 +661,7 @@ def _in_mujoco(
 ) -> GapResult | None:  # fmt: skip
     """What a scene of one MJCF file comes to, if MuJoCo, with the contact of that file,
     does what was measured, or does with what is named; else None."""
+    say("preparing windows in MuJoCo")
     try:
         problem = MujocoProblem(scene, recordings)
     except DoesNotFit:

@@ -1,9 +1,9 @@
 """A scene of one MJCF file, by windows that MuJoCo simulates with that file's contact.
 
-What is soft there creeps, lands and slides otherwise than in Drake: by more than the
-noise of a log that MuJoCo made. Rows are of samples over the covariance that they have
-in a window: noise, what an uncertain start does, which goes together throughout, and
-what contacts that chatter do by chance.
+What is soft there creeps, lands and slides otherwise than in Drake, and what has long
+steps moves otherwise: by more than the noise of a log that MuJoCo made. Rows are of
+samples over the covariance that they have in a window: noise, what an uncertain start
+does, which goes together throughout, and what contacts that chatter do by chance.
 """
 
 from collections.abc import Mapping, Sequence
@@ -358,11 +358,11 @@ def _by_parabola(steps: np.ndarray, left: np.ndarray, reach: float) -> float:
 
 
 def contacts_of_mujoco(problem: MujocoProblem) -> Finding:
-    """That another simulator's contact was compared."""
+    """That another simulator was compared."""
     says = (
-        f"Windows of {WINDOW_SEC:g} s were simulated by MuJoCo, with the contacts and "
-        "the time step of the model's own file. Drake's contacts are others: what "
-        "pushes, slides or lands there moves differently by more than the noise."
+        f"Windows of {WINDOW_SEC:g} s were simulated by MuJoCo, with the contacts, "
+        "stops and time step of the model's own file. In Drake what pushes, slides or "
+        "lands, or has long steps, moves differently by more than the noise."
     )
     name = problem.recordings[0].name
     return Finding("mujoco_contacts", name, "time", WINDOW_SEC, "s", "info", says)

@@ -7,6 +7,7 @@ one joint; M g L sqrt(L / g) [N m s/rad] takes that at the speed sqrt(g / L) at 
 falls.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,9 +40,9 @@ _POWERS = {
 
 @dataclass(frozen=True)
 class Sizes:
-    """mass [kg] of all bodies; length [m] of the longest chain of
-    those that move; slides: joints
-    that slide, and models all joints of which do."""
+    """mass [kg] of all bodies, and of what is as heavy to move as the heaviest rotor;
+    length [m] of the longest chain of those that move; slides: joints that slide, and
+    models all joints of which do."""
 
     mass: float
     length: float
@@ -76,11 +77,21 @@ def sizes_of(plant: MultibodyPlant) -> Sizes:
             reach, at = reach + _between(plant, context, carrier, at), carrier
         length = max(length, float(reach))
     joints = one_dof_joints(plant)
+    if length > 0.0:
+        mass += max(_rotors(plant, length), default=0.0)
     sliding = {j.index() for j in joints if isinstance(j, PrismaticJoint)}
     turning = {model_of(plant, j) for j in joints if j.index() not in sliding}
     slides = {full_name(plant, j) for j in joints if j.index() in sliding}
     models = {model_of(plant, j) for j in joints} - turning
     return Sizes(mass, length, frozenset(slides | models))
+
+
+def _rotors(plant: MultibodyPlant, length: float) -> Iterator[float]:
+    """[kg] at this distance [m] that would be as heavy to move as each rotor."""
+    for i in plant.GetJointActuatorIndices():
+        actuator = plant.get_joint_actuator(i)
+        slides = isinstance(actuator.joint(), PrismaticJoint)
+        yield actuator.default_reflected_inertia() / (1.0 if slides else length**2)
 
 
 def _between(plant, context, one: RigidBody, other: RigidBody) -> float:
