@@ -124,6 +124,7 @@ from makebreak.models.effects.kind import (
     one_dof_joints,
     sliding_joints,
 )
+from makebreak.models.model_files import robot_files
 from makebreak.models.scene import Scene, read_scene
 from makebreak.models.scene_schema import without_shapes
 
@@ -242,6 +243,9 @@ def _run(
         checks += found
 
     known = list(checks)
+    # Of what a file has and Drake does not, too: tendons, loops, water.
+    first = meets or not is_mechanism
+    first |= any(file.notes for file in robot_files(scene).values())
 
     def in_mujoco(*some: Split) -> GapResult | None:
         """What a scene comes to whose world may be MuJoCo's: its steps, contacts and
@@ -264,10 +268,10 @@ def _run(
         if not is_mechanism or result.verdict not in ("gap_unnamed", "not_judged"):
             return result
         clock.lap()
-        tried = (as_read,) if not meets else ()
+        tried = () if first else (as_read,)
         return in_mujoco(*tried, *([split(whole)] if stops else [])) or result
 
-    if meets or not is_mechanism:
+    if first:
         result = in_mujoco(as_read)
         if result is not None:
             return result

@@ -679,6 +679,7 @@ class _Writer:
 
     def _left_out(self) -> None:
         m = self.m
+        lost: dict[str, list[str]] = {}
         for t in range(m.ntendon):
             words = {
                 "stiffness": m.tendon_stiffness[t], "damping": m.tendon_damping[t],
@@ -687,10 +688,14 @@ class _Writer:
             }  # fmt: skip
             there = [word for word, value in words.items() if np.any(value)]
             if there:
-                self.notes.append(
-                    f"tendon {self.name_of('tendon', t)}: its {' and '.join(there)} "
-                    "left out"
-                )
+                name = self.name_of("tendon", t)
+                lost.setdefault(" and ".join(there), []).append(name)
+        for what, names in lost.items():
+            few = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+            one = f"tendon {few}: its" if len(names) == 1 else (
+                f"{len(names)} tendons ({few}): their"
+            )  # fmt: skip
+            self.notes.append(f"{one} {what} left out")
         if m.nflex:
             self.notes.append(f"{m.nflex} flexible bodies: their stiffness is left out")
         if m.opt.density or m.opt.viscosity:

@@ -64,7 +64,7 @@ from makebreak.models.model_export import (
 from makebreak.models.model_files import with_what_files_say
 from makebreak.models.robot_file import path_of
 from makebreak.models.scene import LoadedScene, Scene, actuators_of_model, load_scene
-from makebreak.models.scene_schema import COMMANDS_OF
+from makebreak.models.scene_schema import COMMANDS_OF, without_shapes
 
 MOST_KEPT = 32  # Models.
 HELD = 1e10  # [kg m2], [kg]: what turns it is not seen to move.
@@ -190,7 +190,9 @@ class MujocoTwin:
         return _indexed(compiled(spec), now.loaded.plant, held, commands)
 
     def _with_numbers(self, effects: Sequence[Effect]):
-        scene = replace(self._file, effects=list(effects))
+        # Friction of pairs is set below. Without shapes no mesh is read again.
+        acting = [e for e in effects if KINDS[e.kind].at != "pair"]
+        scene = without_shapes(replace(self._file, effects=acting))
         now = _Numbers(load_scene(scene, DiagramBuilder()))
         spec = self._spec.copy()
         spec.option.gravity = now.loaded.plant.gravity_field().gravity_vector()
@@ -201,7 +203,8 @@ class MujocoTwin:
             own.damping = poly if np.ndim(own.damping) else float(poly[0])
             own.frictionloss, own.armature = numbers.friction, numbers.armature
         self._set_inertias(spec, now)
-        self._set_shapes(spec, now)
+        if scene.plant.shapes:
+            self._set_shapes(spec, now)
         self._set_pairs(spec, effects)
         return spec, now
 
@@ -387,6 +390,7 @@ class _Numbers:
     def __init__(self, loaded: LoadedScene):
         self.loaded, plant = loaded, loaded.plant
         payloads, context = payloads_of(plant), plant.CreateDefaultContext()
+        has_shapes = plant.geometry_source_is_registered()
         inspector = loaded.scene_graph.model_inspector()
         self.inertials: dict[str, np.ndarray] = {}
         self.shapes: dict[str, tuple[Shape, RigidTransform]] = {}
@@ -397,7 +401,7 @@ class _Numbers:
                 six = own.central[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
                 self.inertials[body.name()] = np.array([own.mass, *own.com, *six])
             fixed = plant.IsAnchored(body)
-            for g in plant.GetCollisionGeometriesForBody(body):
+            for g in plant.GetCollisionGeometriesForBody(body) if has_shapes else ():
                 X = inspector.GetPoseInFrame(g)
                 if fixed:
                     X = plant.EvalBodyPoseInWorld(context, body) @ X

@@ -169,13 +169,16 @@ def _is_felt(dynamics: SceneDynamics, shapes, recordings) -> bool:
 def walls_of(dynamics: SceneDynamics, own: bool = False) -> ContactShapes | None:
     """Shapes of links, and of what is fixed and, unless `own`, no part of a robot; None
     if there are not both. Raises: DoesNotFit as ContactShapes."""
-    shapes, bases = ContactShapes(dynamics.loaded, hulls=False), _bases(dynamics.plant)
+    shapes, bases = (
+        ContactShapes(dynamics.loaded, hulls=False),
+        bases_of(dynamics.plant),
+    )
     shapes.keep(lambda body: own or body not in shapes.anchored or body not in bases)
     sides = {s.body in shapes.anchored for s in shapes.surfaces}
     return shapes if sides == {True, False} else None
 
 
-def _bases(plant: MultibodyPlant) -> set[int]:
+def bases_of(plant: MultibodyPlant) -> set[int]:
     """Bodies of the robots' bases: what a joint that moves hangs on, and all that the
     robot's own model has welded to that, other than by way of the world. (The ground
     may be in the same file.)"""

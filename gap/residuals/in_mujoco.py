@@ -11,12 +11,18 @@ from dataclasses import replace
 from functools import cached_property, partial
 
 import numpy as np
+from pydrake.multibody.tree import BodyIndex
 
 from makebreak.gap.data.findings import Finding
 from makebreak.gap.data.recording import Recording
 from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.problem import Candidate, Fitted, Nuisances, SearchPlan, rms
-from makebreak.gap.residuals.impacts import candidates_of, kinds_of_joints, tried
+from makebreak.gap.residuals.impacts import (
+    bases_of,
+    candidates_of,
+    kinds_of_joints,
+    tried,
+)
 from makebreak.gap.residuals.mechanism_candidates import loads
 from makebreak.gap.residuals.objects import MOST_EFFECTS, WindowedProblem
 from makebreak.gap.simulation.mujoco_simulation import MujocoSimulation
@@ -205,9 +211,13 @@ class MujocoProblem(WindowModel, WindowedProblem):
 
     @property
     def met(self) -> Mapping[tuple[str, str], float]:
-        """Of everything that is fixed it is asked along each axis."""
-        places = self.dynamics.places(PLACE)
-        return {(at, axis): 0.0 for at in places for axis in "xyz"}
+        """Of everything that is fixed, but for robots' bases, it is asked along each
+        axis."""
+        plant, places = self.dynamics.plant, self.dynamics.places(PLACE)
+        bases = {
+            full_name(plant, plant.get_body(BodyIndex(k))) for k in bases_of(plant)
+        }
+        return {(at, axis): 0.0 for at in places if at not in bases for axis in "xyz"}
 
     def _model(self) -> WindowModel:
         return self
