@@ -198,6 +198,14 @@ def right(tmp_path_factory):
     return scene, recordings, PressingProblem(scene, recordings)
 
 
+def test_a_robot_that_touches_itself_presses_on_nothing_by_that(right, monkeypatch):
+    """Of a pair of its own links no body is fixed."""
+    problem = right[2]
+    assert problem._touched_axes()
+    monkeypatch.setattr(problem.shapes, "anchored", set())
+    assert problem._soft_bodies() == set() and problem._touched_axes() == {}
+
+
 @pytest.fixture(scope="module")
 def displaced(tmp_path_factory):
     folder = tmp_path_factory.mktemp("displaced")

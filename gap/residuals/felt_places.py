@@ -208,10 +208,11 @@ class FeltPlaces(FixedFaces):
         for pair, on in met.items():
             mine = [s for s in slots if self._pair_of(s) == pair]
             depth = self._W @ np.maximum(-np.min([s.phi for s in mine], axis=0), 0.0)
-            (body,) = set(pair) & self.shapes.anchored
             force = mine[0].stiffness * float(depth[on].sum())
-            by_depth[body] = by_depth.get(body, 0.0) + force
-            by_force[body] = by_force.get(body, 0.0) + float(pressed[pair][on].sum())
+            for body in set(pair) & self.shapes.anchored:  # None of a robot's own.
+                by_depth[body] = by_depth.get(body, 0.0) + force
+                felt = float(pressed[pair][on].sum())
+                by_force[body] = by_force.get(body, 0.0) + felt
         return {k for k, force in by_depth.items() if force < SOFT * by_force[k]}
 
     def _felt_faces(

@@ -562,10 +562,10 @@ class PressingProblem(FeltPlaces):
             pair = self._pair_of(s)
             if pair not in self._met:
                 continue
-            (body,) = set(pair) & self.shapes.anchored
             on = geometry.masks[s.key]
             mean = np.abs(s.normal[on]).mean(axis=0)
             axis = AXES[int(np.argmax(mean))]
-            known = self.off.get(body, {}).get(axis, 0.0)
-            found.setdefault(body, {})[axis] = known
+            for body in set(pair) & self.shapes.anchored:  # None of a robot's own.
+                known = self.off.get(body, {}).get(axis, 0.0)
+                found.setdefault(body, {})[axis] = known
         return {body: {a: by[a] for a in AXES if a in by} for body, by in found.items()}
