@@ -330,8 +330,12 @@ def named(choice: Choice, plant: MultibodyPlant, beside: str = "") -> NamedEffec
         choice.ties,
         apart if choice.ties else "",
         "weak" if weak else "identifiable",
-        sliding=frozenset(at for tie in choice.ties for at in tie.at)
-        & sliding_joints(plant),
+        sliding=frozenset(
+            at
+            for tie in choice.ties
+            if KINDS[tie.kind].at in ("joint", "actuator") and of_slides(tie, plant)
+            for at in tie.at
+        ),
     )
 
 

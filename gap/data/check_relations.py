@@ -90,7 +90,7 @@ def _velocity_findings(
         )
         add("clock_skew", r.skew, "s/s", "warning", says)
     elif is_late(r):
-        says = says_late([name], r, ", beyond its declared filter" if filters else "")
+        says = says_late([name], [r], ", beyond its declared filter" if filters else "")
         add("velocity_lag", r.lag, "s", "warning", says)
     return found
 
@@ -110,16 +110,19 @@ def is_late(r: Relation) -> bool:
     return abs(r.lag) > max(SURE * r.lag_std, 0.15 * r.period)
 
 
-def says_late(names: Sequence[str], r: Relation, beyond: str = "") -> str:
-    """A sentence for velocities that are late. r: of the first; beyond: what is
-    declared already."""
-    late = "after" if r.lag > 0.0 else "before"
+def says_late(names: Sequence[str], each: Sequence[Relation], beyond: str = "") -> str:
+    """A sentence for velocities that are late, or early, or differences. beyond: what
+    is declared already."""
+    lags = sorted(1e3 * abs(r.lag) for r in each)
+    by = f"{lags[0]:.3g} +- {1e3 * each[0].lag_std:.2g} ms"
+    if f"{lags[0]:.2g}" != f"{lags[-1]:.2g}":
+        by = f"{lags[0]:.3g} to {lags[-1]:.3g} ms"
     comes, it = ("come", "them") if len(names) > 1 else ("comes", "it")
-    as_what = f", as a backward difference of {it} would" if r.of_a_difference() else ""
-    return (
-        f"{', '.join(names)} {comes} {abs(r.lag) * 1e3:.3g} +- {r.lag_std * 1e3:.2g} ms"
-        f" {late} position{beyond}{as_what}."
-    )
+    as_what = ""
+    if each[0].of_a_difference():
+        as_what = f", as a backward difference of {it} would"
+    late = "after" if each[0].lag > 0.0 else "before"
+    return f"{', '.join(names)} {comes} {by} {late} position{beyond}{as_what}."
 
 
 def _spin_findings(recording: Recording, at: str) -> list[Finding]:

@@ -40,7 +40,7 @@ def with_late_velocities(
     rows = _longest(of["time"].values(columns))
     t = of["time"].values(columns)[rows]
     told: dict[str, str] = {}
-    alike: dict[str, list[tuple[str, Relation]]] = {}
+    alike: dict[tuple[bool, bool], list[tuple[str, Relation]]] = {}
     for name in of:
         at, _, what = name.rpartition(".")
         position = f"{at}.position"
@@ -56,11 +56,11 @@ def with_late_velocities(
         if r.of_a_difference():
             text = DIFFERENCE
         told[name if r.lag > 0.0 or text == DIFFERENCE else position] = text
-        alike.setdefault(text if text == DIFFERENCE else name, []).append((name, r))
+        alike.setdefault((text == DIFFERENCE, r.lag > 0.0), []).append((name, r))
     said = []
     for some in alike.values():
         names, each = zip(*some, strict=True)
-        says = f"{says_late(names, each[0])} The proposed sidecar declares that."
+        says = f"{says_late(names, each)} The proposed sidecar declares that."
         said.append((names[0], float(each[0].lag), says))
     return [replace(m, filter=told.get(str(m.channel), "")) for m in matches], said
 
