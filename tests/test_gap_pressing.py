@@ -202,6 +202,9 @@ def test_a_robot_that_touches_itself_presses_on_nothing_by_that(right, monkeypat
     """Of a pair of its own links no body is fixed."""
     problem = right[2]
     assert problem._touched_axes()
+    known = problem._slots(()), problem._pressing(), problem._geometry([])
+    for name, value in zip(("_slots", "_pressing", "_geometry"), known, strict=True):
+        monkeypatch.setattr(problem, name, lambda *_, value=value: value)
     monkeypatch.setattr(problem.shapes, "anchored", set())
     assert problem._soft_bodies() == set() and problem._touched_axes() == {}
 
