@@ -42,7 +42,7 @@ from makebreak.gap.residuals.late_poses import wanted
 from makebreak.gap.residuals.mechanism import MechanismProblem
 from makebreak.gap.residuals.whitened_rows import WhitenedRows
 from makebreak.gap.result import Estimate, GapMeasure, Tried
-from makebreak.gap.search import comparison, drop
+from makebreak.gap.search import add, comparison, drop
 from makebreak.gap.search.choice import (
     Choice,
     Selection,
@@ -1617,3 +1617,18 @@ def test_one_cause_stands_in_the_place_of_many_and_none_of_what_undoes_it():
     assert gained == pytest.approx(4.0 * 600, rel=0.2)
     for r in (3.0 * many[:, 2], -2.0 * one, 2.0 * (one - many.sum(axis=1))):
         assert in_place_of_others(columns, r + noise, 1.0)[1] <= 0.0
+
+
+@pytest.mark.parametrize(("both", "taken"), [(0.55, False), (0.45, True)])
+def test_two_effects_leave_less_than_either_alone(monkeypatch, both, taken):
+    """A door's damping and a joint's drag left 0.55, its mass alone 0.49."""
+
+    def leaving(score):
+        return SimpleNamespace(fit=SimpleNamespace(score=score))
+
+    pair, none = leaving(both), object()
+    monkeypatch.setattr(add, "fit_each", lambda *_: [pair])
+    monkeypatch.setattr(add, "pair_instead", lambda *_: none)
+    trials = [leaving(0.62), leaving(0.49)]
+    found = add._pair(None, object(), (None, None), [], [], trials, 0)
+    assert found is (pair if taken else none)

@@ -189,8 +189,10 @@ def _pair(
     needed, else two others that leave clearly less."""
     wide, screen = screens
     if both is not None:
+        least = min(t.fit.score for t in trials)
         for trial in fit_each(search, screen, chosen, [both]):
-            return trial
+            if trial.fit.score < least:  # Else one alone does as well as the two.
+                return trial
     return pair_instead(search, wide, screen, chosen, ranked, trials[pick])
 
 
