@@ -1,6 +1,7 @@
 """Dictionaries of arrays, .npz and .mat, and other files that people have."""
 
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -32,7 +33,7 @@ def test_a_dictionary_of_an_actuator_network_is_columns_with_joints_names(tmp_pa
     assert "images (300, 4, 4)" in told["not_columns"]
 
 
-@pytest.mark.parametrize("number", [{"frequency": 200}, {"fs": 200.0}, {"dt_ms": 5},
+@pytest.mark.parametrize("number", [{"frequency": 200}, {"fps": 200.0}, {"dt_ms": 5},
                                     {"sample_rate": 200}, {"step_dt": 0.005},
                                     {"control_frequency_hz": 200}])  # fmt: skip
 def test_a_number_gives_the_time_where_no_column_does(tmp_path, number):
@@ -57,17 +58,85 @@ def test_a_mat_file_is_read_with_its_structs_either_way_round(tmp_path):
     np.testing.assert_array_equal(columns["scope/signals/q_knee/values"], Q[:, 1])
 
 
-HDF5 = b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + 400 * b"\0"
+@pytest.fixture
+def h5py():
+    return pytest.importorskip("h5py", reason="the extra `hdf5` is not installed")
+
+
+def test_groups_of_an_hdf5_file_that_count_runs_are_episodes(tmp_path, h5py):
+    """As robomimic saves demonstrations; the tenth comes after the second."""
+    with h5py.File(tmp_path / "a.hdf5", "w") as file:
+        for k, rows in ((10, slice(100, N)), (2, slice(0, 100))):
+            demo = file.create_group(f"data/demo_{k}")
+            demo.attrs.update(num_samples=rows.stop - rows.start, fps=200.0, by="me")
+            demo["obs/joint_pos"], demo["actions"] = Q[rows], 2.0 * Q[rows, :1]
+            demo["obs/camera"] = np.zeros((rows.stop - rows.start, 4, 4, 3), np.uint8)
+        file["mask/train"] = np.array([b"demo_2", b"demo_10"])
+    columns = read_table(tmp_path / "a.hdf5").columns
+    np.testing.assert_allclose(columns["time"], TIME, atol=1e-12)
+    np.testing.assert_array_equal(columns["episode"], np.arange(N) >= 100)
+    np.testing.assert_array_equal(columns["obs/joint_pos[2]"], Q[:, 2])
+    np.testing.assert_array_equal(columns["actions"], 2.0 * Q[:, 0])
+    assert len(columns) == 6
+
+
+def test_an_hdf5_file_is_arrays_attributes_and_tables(tmp_path, h5py):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.attrs["fps"], file.attrs["joint_names"] = 200, NAMES
+        file["observations/qpos"], file["action"] = Q, 2.0 * Q
+        file["observations/image"] = np.zeros((N, 4, 4))
+        own = np.zeros(N, [("stamp", float), ("tau", float)])
+        own["tau"] = Q[:, 1]
+        file["motor"] = own
+    table = read_table(tmp_path / "a.h5", unused=frozenset(["action", "motor/stamp"]))
+    columns = table.columns
+    np.testing.assert_allclose(columns["time"], TIME, atol=1e-12)
+    np.testing.assert_array_equal(columns["observations/qpos/knee"], Q[:, 1])
+    np.testing.assert_array_equal(columns["motor/tau"], Q[:, 1])
+    assert (
+        len(columns) == 5 and "observations/image" in dict(table.notes)["not_columns"]
+    )
+
+
+def test_a_mat_file_of_version_7_3_is_read_as_the_older_ones(tmp_path, h5py):
+    """HDF5 behind 512 bytes, arrays the other way round, texts and cells of them."""
+    with h5py.File(tmp_path / "a.mat", "w", userblock_size=512) as file:
+        file["log/t"], file["log/q"] = TIME[None], Q.T
+        file["note"] = np.array([[ord(c)] for c in "rig 2"], np.uint16)
+        file["note"].attrs["MATLAB_class"] = np.bytes_("char")
+        cells = []
+        for k, name in enumerate(NAMES):
+            text = np.array([[ord(c)] for c in name], np.uint16)
+            file[f"#refs#/{k}"] = text
+            file[f"#refs#/{k}"].attrs["MATLAB_class"] = np.bytes_("char")
+            cells.append(file[f"#refs#/{k}"].ref)
+        file.create_dataset("joint_names", data=[cells], dtype=h5py.ref_dtype)
+    with (tmp_path / "a.mat").open("r+b") as file:
+        file.write(b"MATLAB 7.3 MAT-file")
+    columns = read_table(tmp_path / "a.mat").columns
+    np.testing.assert_array_equal(columns["log/t"], TIME)
+    np.testing.assert_array_equal(columns["log/q/ankle"], Q[:, 2])
+    assert len(columns) == 4
+
+
+def test_hdf5_without_h5py_is_one_line_that_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    (tmp_path / "a.h5").write_bytes(b"\x89HDF\r\n\x1a\n")
+    with pytest.raises(ValueError, match=r"pip install 'makebreak\[hdf5\]'"):
+        read_table(tmp_path / "a.h5")
+
+
+HDF5 = b"MATLAB 7.3 MAT-file".ljust(512) + b"\x89HDF\r\n\x1a\n" + 400 * b"\0"
 
 
 @pytest.mark.parametrize(
     ("name", "content", "says"),
     [
-        ("a.mat", HDF5, "version 7.3 .* '-v7'"),
+        ("a.mat", HDF5, "is no HDF5 file"),
         ("a.mat", b"no such thing", "is no .mat file"),
         ("a.pt", b"PK", r"pickled objects, .* save its arrays as npz"),
         ("a.pkl", b"", r"pickled objects"),
-        ("a.hdf5", b"", r"HDF5 is not read: save its arrays with np.savez"),
+        ("a.hdf5", b"none", "is no HDF5 file"),
     ],
 )
 def test_what_is_not_read_is_one_line_that_says_what_to_do(
@@ -132,6 +201,20 @@ def test_a_json_document_is_its_arrays_or_the_objects_of_its_longest_list(
         expected[5] = np.nan
     np.testing.assert_array_equal(columns[q], expected)
     np.testing.assert_array_equal(columns[next(iter(columns))], TIME)
+
+
+def test_runs_that_a_json_document_counts_by_name_are_episodes(tmp_path):
+    """Joints that it counts are none."""
+    runs = {f"run {k}": {"q": Q[: 100 + k].tolist(), "dt": 0.005} for k in range(3)}
+    (tmp_path / "a.json").write_text(json.dumps({"by": "rig 2", "log": runs}))
+    columns = read_table(tmp_path / "a.json").columns
+    assert np.bincount(np.int64(columns["episode"])).tolist() == [100, 101, 102]
+    assert np.ptp(columns["time"]) == pytest.approx(302 * 0.005)
+    joints = {f"joint_{k}": {"q": Q[:, k].tolist()} for k in range(3)}
+    (tmp_path / "b.json").write_text(json.dumps(joints))
+    assert list(read_table(tmp_path / "b.json").columns) == [
+        "joint_0/q", "joint_1/q", "joint_2/q",
+    ]  # fmt: skip
 
 
 def test_a_json_with_a_number_beside_its_rows_has_the_time_of_it(tmp_path):

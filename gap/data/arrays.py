@@ -1,4 +1,4 @@
-"""Dictionaries of arrays as one table: .npz, .npy, MATLAB's .mat, lines of JSON.
+"""Dictionaries of arrays as one table: .npz, .npy, MATLAB's .mat, HDF5, JSON.
 
 What has a row for each instant is a column, whichever way round it lies; a number such
 as `dt` or `frequency` gives the time where no column does; a list of joints' names
@@ -12,8 +12,11 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+
+from makebreak.gap.data.hdf5 import HDF5, is_hdf5, read_tree
 
 STRETCHES = 20  # Of rows, of a table too long to keep.
 MOST_BYTES = 1 << 32  # Of an npz file's columns together, as they are in memory.
@@ -26,16 +29,19 @@ TIME_WORDS = set(
 # Scalars between two rows, and of rows a second, in small letters without signs.
 _PERIOD = re.compile(r"(\w*(time|step|control|sim|sample)_?)?(dt|period)|time_?step|"
                      r"sampl(e|ing)_?time|ts")  # fmt: skip
-_RATE = re.compile(r"\w*(frequency|freq|hz|fs)|\w*(sampl(e|ing)|control|log)_?rate")
+_RATE = re.compile(r"\w*(frequency|freq|hz|fps|fs)|\w*(sampl(e|ing)|control|log)_?rate")
 _OF_A_BODY = set("quat quaternion root base imu pose foot feet contact".split())
+_RUNS = set(
+    "demo demos episode episodes ep run runs trial traj trajectory rollout take test "
+    "experiment exp recording log session".split()
+)
 _PICKLES = (".pt", ".pth", ".pkl", ".pickle", ".joblib")
 _PICKLED = (
     "it holds pickled objects, which can run code when they are read: save its arrays "
     "as npz, as in np.savez('log.npz', **{k: np.asarray(v) for k, v in log.items()})"
 )
-_HDF5 = (".h5", ".hdf5", ".hdf")
 _LINES = (".jsonl", ".ndjson")
-ARRAYS = (".npz", ".npy", ".mat", ".json", *_LINES)
+ARRAYS = (".npz", ".npy", ".mat", ".json", *HDF5, *_LINES)
 
 Read = tuple[dict[str, np.ndarray], np.ndarray, int, list[tuple[str, str]]]
 
@@ -48,11 +54,7 @@ def words_of(name: str) -> list[str]:
 
 def why_not(suffix: str) -> str:
     """What to do with a file of another format; "" if there is nothing to say."""
-    if suffix in _PICKLES:
-        return _PICKLED
-    if suffix in _HDF5:
-        return "HDF5 is not read: save its arrays with np.savez('log.npz', time=..., )"
-    return ""
+    return _PICKLED if suffix in _PICKLES else ""
 
 
 def kept_rows(n_rows: int, n_columns: int, most_cells: int) -> list[tuple[int, int]]:
@@ -125,20 +127,16 @@ def read_npy(path: Path, most_cells: int, unused: frozenset[str]) -> Read:
 
 
 def read_mat(path: Path, most_cells: int, unused: frozenset[str]) -> Read:
-    """The same of a MATLAB file of version 4 to 7.2; a struct's fields are
-    <struct>/<field>.
+    """The same of a MATLAB file; a struct's fields are <struct>/<field>.
 
     Raises: ValueError, one line.
     """
     from scipy.io import loadmat
 
+    if is_hdf5(path):  # Version 7.3.
+        return read_hdf5(path, most_cells, unused)
     try:
         content = loadmat(path, simplify_cells=True)
-    except NotImplementedError:
-        raise ValueError(
-            f"recording {path} is a MATLAB file of version 7.3 (HDF5), which is not "
-            "read: save it again with save('log.mat', ..., '-v7')"
-        ) from None
     except Exception as error:  # The library raises whatever its parser runs into.
         why = " ".join(str(error).split())[:100] or type(error).__name__
         raise ValueError(
@@ -173,12 +171,41 @@ def read_json(path: Path, most_cells: int, unused: frozenset[str]) -> Read:
         content = json.loads(path.read_text(errors="replace"))
     except (ValueError, RecursionError) as error:
         raise ValueError(f"recording {path} is no JSON: {error}") from None
-    rows: list = []
+    return _of_document(path, content, most_cells, unused)
+
+
+def read_hdf5(path: Path, most_cells: int, unused: frozenset[str]) -> Read:
+    """The same of an HDF5 file: groups are as JSON's objects.
+
+    Raises: ValueError, one line.
+    """
+    content = read_tree(path, unused, MOST_BYTES)
+    return _of_document(path, content, most_cells, unused)
+
+
+def _of_document(path: Path, content, most_cells: int, unused: frozenset[str]) -> Read:
+    content, rows = _counted(content), []
     if episodes := next(_lists_of_episodes(content), None):
         content = _without(content, episodes) | _one_after_another(episodes)
     else:
         rows = max(_lists_of_objects(content), key=len, default=[])
     return _of_rows(path, rows, _without(content, rows), most_cells, unused)
+
+
+def _counted(value):
+    """With lists in the place of objects that are numbered runs (demo_0, demo_1)."""
+    if isinstance(value, list):
+        return [_counted(each) for each in value]
+    if not isinstance(value, dict):
+        return value
+    own = {k: _counted(each) for k, each in value.items()}
+    runs = {k: each for k, each in own.items()
+            if isinstance(each, dict) and _RUNS & {*words_of(str(k))}
+            and str(k)[-1].isdigit()}  # fmt: skip
+    if not runs:
+        return own
+    each = sorted(runs, key=lambda k: int(words_of(k)[-1]))
+    return {**{k: own[k] for k in own.keys() - runs}, "": [runs[k] for k in each]}
 
 
 def _lists_of_episodes(value) -> Iterator[list[dict]]:
@@ -196,23 +223,29 @@ def _lists_of_episodes(value) -> Iterator[list[dict]]:
             yield from _lists_of_episodes(each)
 
 
-def _columns_in(value: Mapping) -> dict[str, list]:
+def _columns_in(value: Mapping) -> dict[str, list | np.ndarray]:
     """Lists of the longest kind that an object has, of a row's numbers each."""
     lists = {k: v for k, v in _leaves("", value)
-             if isinstance(v, list) and len(v) >= FEWEST
-             and not isinstance(v[0], str | dict)}  # fmt: skip
+             if isinstance(v, list | np.ndarray) and np.ndim(v) and len(v) >= FEWEST
+             and not isinstance(v[0], str | bytes | dict)}  # fmt: skip
     n = max(map(len, lists.values()), default=0)
     return {k: v for k, v in lists.items() if len(v) == n}
 
 
-def _one_after_another(episodes: Sequence[Mapping]) -> dict[str, list]:
-    """Columns of all episodes, and which a row is of, where they are several."""
+def _one_after_another(episodes: Sequence[Mapping]) -> dict[str, object]:
+    """Columns of all episodes, which a row is of, where they are several, and what is
+    not a column and the same in all."""
     parts = [_columns_in(each) for each in episodes]
     columns = {k: [x for part in parts for x in part[k]] for k in parts[0]}
     if len(parts) > 1 and "episode" not in columns:
         counts = [len(next(iter(part.values()))) for part in parts]
         columns["episode"] = np.repeat(np.arange(len(parts)), counts).tolist()
-    return columns
+    others = [
+        {k: v for k, v in _leaves("", each) if k not in columns} for each in episodes
+    ]
+    once = {k: v for k, v in others[0].items()
+            if all(k in each and np.array_equal(each[k], v) for each in others)}  # fmt: skip
+    return {**once, **columns}
 
 
 def _lists_of_objects(value) -> Iterator[list]:
@@ -246,6 +279,8 @@ def _of_rows(
     names = [*dict.fromkeys(n for row in flat for n in row), *once]
 
     def load(name: str):
+        if name in once and once[name] is None:
+            return None
         if name in once:
             each = [once[name]]
         else:
@@ -264,10 +299,11 @@ def _of_rows(
 READERS = {
     ".npz": read_npz, ".npy": read_npy, ".mat": read_mat,
     ".json": read_json, **dict.fromkeys(_LINES, read_lines),
+    **dict.fromkeys(HDF5, read_hdf5),
 }  # fmt: skip
 
 
-def _leaves(name: str, value) -> Iterator[tuple[str, object]]:
+def _leaves(name: str, value) -> Iterator[tuple[str, Any]]:
     """All arrays and numbers below a struct, or a list of structs."""
     below = f"{name}/" if name else ""
     if isinstance(value, dict):

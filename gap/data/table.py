@@ -201,7 +201,7 @@ def read_table(
     bad: BadRows | None = None,
     unused: frozenset[str] = frozenset(),
 ) -> RecordingTable:
-    """Reads a table in text, an npz, mat or parquet file, a bag or a LeRobot dataset;
+    """Reads a table in text, an npz, mat, HDF5 or parquet file, a bag or a dataset;
     nothing but its numbers is looked at.
 
     Args:

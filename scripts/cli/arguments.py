@@ -251,7 +251,7 @@ def make_parser(functions: Mapping[str, Callable]) -> argparse.ArgumentParser:
         "recordings",
         nargs="+",
         metavar="RECORDING",
-        help="a log: .csv, .npz, .mat, .parquet, a ROS bag or a LeRobot dataset; a "
+        help="a log: .csv, .npz, .mat, .h5, .parquet, a bag or a LeRobot dataset; a "
         "pattern ('runs/*.csv') or a folder names several",
     )
     sidecar_help = "what the columns are (default: LOG.yaml, else another log's)"
@@ -358,7 +358,7 @@ def make_parser(functions: Mapping[str, Callable]) -> argparse.ArgumentParser:
         "log",
         nargs="+",
         metavar="LOG",
-        help="a log: .csv, .npz, .mat, .parquet, a ROS bag or a LeRobot dataset; a "
+        help="a log: .csv, .npz, .mat, .h5, .parquet, a bag or a LeRobot dataset; a "
         "pattern or a folder names several",
     )
     p.add_argument("--sidecar", metavar="FILE", help=sidecar_help)
