@@ -243,8 +243,10 @@ def _one_after_another(episodes: Sequence[Mapping]) -> dict[str, object]:
     others = [
         {k: v for k, v in _leaves("", each) if k not in columns} for each in episodes
     ]
-    once = {k: v for k, v in others[0].items()
-            if all(k in each and np.array_equal(each[k], v) for each in others)}  # fmt: skip
+    once = {
+        k: v for k, v in others[0].items()
+        if all(k in each and np.array_equal(each[k], v) for each in others)
+    }  # fmt: skip
     return {**once, **columns}
 
 
