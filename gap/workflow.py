@@ -98,7 +98,7 @@ from makebreak.gap.search.select import select, without
 from makebreak.gap.search.trust import drift_sentences, scatter, trust_in
 from makebreak.gap.simulation.measure import WINDOW_SEC
 from makebreak.gap.simulation.scene_simulation import SceneSimulation
-from makebreak.gap.simulation.windows import WindowModel, with_step
+from makebreak.gap.simulation.windows import WindowModel, by_measured, with_step
 from makebreak.gap.thresholds import (
     AGREEMENT_RMS_MAX,
     CLOSED_SHARE_MIN,
@@ -243,18 +243,21 @@ def _run(
         checks += found
 
     known = list(checks)
-    # Of what a file has and Drake does not, too: tendons, loops, water.
+    # Of what a file has and Drake does not, too: tendons, loops, water. Measured
+    # efforts, with their noise, tell more in equations than in windows.
     first = meets or not is_mechanism
     first |= any(file.notes for file in robot_files(scene).values())
+    first &= not any(by_measured(scene, r) for r in parts.decided)
 
-    def in_mujoco(*some: Split) -> GapResult | None:
+    def in_mujoco(*some: Split, named: Sequence[Effect] = ()) -> GapResult | None:
         """What a scene comes to whose world may be MuJoCo's: its steps, contacts and
-        water; and its stops, if too little is without them."""
+        water; and its stops, if too little is without them. None where what is named
+        explains that as well."""
         for each in some:
             decided, reported, done = _conditioned(each, dynamics, False)
             reported = excerpt(reported, REPORTED_SEC, REPORTED_ROWS)
             told = [c for c in known if each is as_read or c not in stops] + done
-            ask = partial(_in_mujoco, given, decided, reported, told, jobs, say)
+            ask = partial(_in_mujoco, given, decided, reported, told, jobs, say, named)
             with budget.share(1.5).running() as own:
                 found = own.if_time("simulating windows with MuJoCo", ask, None)
             seconds["MuJoCo"] = seconds.get("MuJoCo", 0.0) + clock.lap()
@@ -263,13 +266,17 @@ def _run(
         return None
 
     def unless_in_mujoco(result: GapResult) -> GapResult:
-        """Where nothing else explains what a robot does."""
+        """Where nothing else explains what a robot does, or what pushes it does it in
+        another way."""
         result = replace(result, seconds={**seconds, **result.seconds})
-        if not is_mechanism or result.verdict not in ("gap_unnamed", "not_judged"):
+        unnamed = result.verdict in ("gap_unnamed", "not_judged")
+        if not is_mechanism or not (unnamed or meets and result.effects):
             return result
         clock.lap()
         tried = () if first else (as_read,)
-        return in_mujoco(*tried, *([split(whole)] if stops else [])) or result
+        named = [] if unnamed else result.scene_effects()
+        with_stops = [split(whole)] if stops and unnamed else []
+        return in_mujoco(*tried, *with_stops, named=named) or result
 
     if first:
         result = in_mujoco(as_read)
@@ -662,13 +669,17 @@ def creep() -> Finding:
 def _in_mujoco(
     scene: Scene, recordings: Sequence[Recording], reported: Sequence[Recording],
     checks: Sequence[Finding], jobs: int, say: Callable[[str], None],
+    named: Sequence[Effect] = (),
 ) -> GapResult | None:  # fmt: skip
     """What a scene of one MJCF file comes to, if MuJoCo, with the contact of that file,
-    does what was measured, or does with what is named; else None."""
+    does what was measured, or does with what is named; else None, as where it does so
+    with what was `named` without it."""
     say("preparing windows in MuJoCo")
     try:
         problem = MujocoProblem(scene, recordings)
     except DoesNotFit:
+        return None
+    if named and problem.does_with(named):
         return None
     say("searching the catalogue in MuJoCo")
     selection = select(problem, say)

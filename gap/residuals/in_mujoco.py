@@ -15,7 +15,6 @@ from pydrake.multibody.tree import BodyIndex
 
 from makebreak.gap.data.findings import Finding
 from makebreak.gap.data.recording import Recording
-from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.problem import Candidate, Fitted, Nuisances, SearchPlan, rms
 from makebreak.gap.residuals.impacts import (
     bases_of,
@@ -31,10 +30,11 @@ from makebreak.gap.simulation.windows import (
     LARGEST,
     Window,
     WindowModel,
+    by_measured,
     moved,
     seen_in,
 )
-from makebreak.gap.thresholds import UNEXPLAINED_RMS
+from makebreak.gap.thresholds import AGREEMENT_RMS_MAX, UNEXPLAINED_RMS
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.ground import PLACE
 from makebreak.models.effects.kind import Effect, full_name, one_dof_joints
@@ -51,6 +51,7 @@ CALM_SEC, LEAST = 0.3, 0.65
 # Of windows: of more the model is wrong, not their starts. Starts that are tried of a
 # window, about the best so far, and how wide.
 MOST_LOUD, DRAWS, WIDTHS = 0.5, 12, (1.0, 0.5, 0.25)
+DRAWN = 6  # Of errors of measured efforts.
 PART_SEC = 0.1  # Of a window, where parts are held out.
 # Relative: where contacts chatter slopes over smaller steps say what chance does.
 DIFF_STEP = 0.1
@@ -88,8 +89,6 @@ class MujocoProblem(WindowModel, WindowedProblem):
             simulation=MujocoSimulation(scene),
         )  # fmt: skip
         self.dynamics.friction_of = lambda pair: self._pairs_met.get(pair)
-        if any(map(self._by_measured, self.recordings)):
-            raise DoesNotFit("measured efforts drive the joints: these drift")
         self.windows = [self._as_smoothed(w) for w in self.windows]
         self._weighed_by: tuple = ()
         self._in_parts = False
@@ -253,10 +252,11 @@ class MujocoProblem(WindowModel, WindowedProblem):
         finally:
             self.windows = kept
         far = np.max([np.nan_to_num(np.ptp(y, axis=0)) for y in plain], axis=0)
+        driven = self._by_errors_of_efforts(effects, plain)
         own = np.sqrt(self.noise**2 + (BLUR * far) ** 2)
         self._own, self._start = [], []
         for k, w in enumerate(kept):
-            mine = np.sqrt(own**2 + CHANCE * bent[k] / len(moves))
+            mine = np.sqrt(own**2 + CHANCE * bent[k] / len(moves) + driven[k])
             self._own.append(mine)
             by = np.stack([y[k] / mine for y in apart], axis=-1)
             by = np.nan_to_num(by, posinf=0.0, neginf=0.0)
@@ -265,6 +265,30 @@ class MujocoProblem(WindowModel, WindowedProblem):
             self._start.append((A, 1.0 - 1.0 / np.sqrt(1.0 + size**2)))
             wide = mine * np.sqrt(1.0 + np.sum(by**2, axis=-1))
             self.windows[k] = replace(w, std=wide)
+
+    def _by_errors_of_efforts(self, effects, plain) -> list[np.ndarray]:
+        """Variance that noise of measured efforts makes of the samples of each window,
+        where these stand in for commands."""
+        made = [np.zeros_like(y) for y in plain]
+        if any(by_measured(self.scene, r) for r in self.recordings):
+            for self.effort_draw in range(1, DRAWN + 1):
+                for total, a, b in zip(
+                    made, self.simulate(effects), plain, strict=True
+                ):
+                    total += np.nan_to_num(a - b, posinf=0.0, neginf=0.0) ** 2 / DRAWN
+            self.effort_draw = 0
+        return made
+
+    def does_with(self, effects: Sequence[Effect]) -> bool:
+        """Whether MuJoCo does what was measured with these; not where it cannot have
+        them."""
+        try:
+            self._weigh(effects)
+            return rms(self.residual(effects)) <= AGREEMENT_RMS_MAX
+        except ValueError:
+            return False
+        finally:
+            self._weigh(())
 
     def residual(self, effects: Sequence[Effect] = ()) -> np.ndarray:
         """(m,) over the covariance of each window."""

@@ -28,7 +28,14 @@ from makebreak.gap.simulation.contact_shapes import (
 )
 from makebreak.gap.simulation.face_supports import LiesOn, add_supports
 from makebreak.gap.simulation.scene_simulation import SceneSimulation
-from makebreak.gap.simulation.windows import BESIDE, TURN, Window, WindowModel, drawn
+from makebreak.gap.simulation.windows import (
+    BESIDE,
+    TURN,
+    Window,
+    WindowModel,
+    by_measured,
+    drawn,
+)
 from makebreak.models.dynamics import SceneDynamics
 from makebreak.models.effects import KINDS
 from makebreak.models.effects.contact import FRICTION
@@ -134,7 +141,7 @@ class PushWindows(WindowModel):
         rows = recording.time[episode.rows]
         now = np.searchsorted(rows, given.time, "right") - 1
         columns = dict(given.columns)
-        for joint in self._by_measured(recording):
+        for joint in by_measured(self.scene, recording):
             channel = recording.channels[f"{joint}.effort_measured"]
             jumps = jump_variance(recording[channel.name][episode.rows], channel.noise)
             off = np.sqrt(channel.noise**2 + jumps) * rng.normal(size=len(rows))

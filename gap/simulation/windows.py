@@ -188,6 +188,7 @@ class WindowModel(WindowedResidual):
     """
 
     commands_late = 0.0
+    effort_draw = 0  # Which errors are drawn of measured efforts; 0: none.
     rows_sec = 0.0  # Rows closer than this are left out.
 
     def __init__(
@@ -277,7 +278,7 @@ class WindowModel(WindowedResidual):
 
     def has_commands(self) -> bool:
         """Whether any recording has commands that the scene's drives take."""
-        return any(self._commanded(recording) for recording in self.recordings)
+        return any(commanded(self.scene, recording) for recording in self.recordings)
 
     def row_sec(self) -> float:
         """Period of the rows [s]: the shortest of the recordings'."""
@@ -449,9 +450,11 @@ class WindowModel(WindowedResidual):
         were given, if effects make their measurement late."""
         late = {
             joint: given_late(effects, f"{joint}.effort_measured")
-            for joint in self._driven("effort_command")
+            for joint in _driven(self.scene, "effort_command")
         }
-        key = (*late.values(), *(e.key for e in effects if self._untold))
+        key = (
+            self.effort_draw, *late.values(), *(e.key for e in effects if self._untold)
+        )  # fmt: skip
         if key in self._commands:
             return self._commands[key]
         dynamics = None
@@ -459,7 +462,7 @@ class WindowModel(WindowedResidual):
             dynamics = SceneDynamics(replace(self.scene, effects=list(effects)))
         out = []
         for i, recording in enumerate(self.recordings):
-            names = self._commanded(recording)
+            names = commanded(self.scene, recording)
             of: dict[int, Commands] = {}
             for episode in recording.episodes:
                 time = recording.time[episode.rows]
@@ -488,11 +491,14 @@ class WindowModel(WindowedResidual):
         )
         middle = time + 0.5 * np.diff(time, append=time[-1])
         columns = {}
-        for joint in self._driven("effort_command"):
+        rng = np.random.default_rng((self.effort_draw, i, episode.first))
+        for joint in _driven(self.scene, "effort_command"):
             key = f"{joint}.effort_measured"
             if key not in recording:
                 continue
             y = recording[key][episode.rows]
+            if self.effort_draw:
+                y = y + recording.channels[key].noise * rng.normal(size=len(y))
             good = np.isfinite(y)
             stages = recording.channels[key].stages or ()
             shown = middle + mean_delay(stages) + late[joint]
@@ -575,7 +581,7 @@ class WindowModel(WindowedResidual):
         of what is white [(N m)^2 s], and (n,) the variance of what is the same
         throughout a window [(N m)^2]."""
         white, steady = np.zeros(n), np.zeros(n)
-        for name in self._by_measured(recording):
+        for name in by_measured(self.scene, recording):
             channel = recording.channels[f"{name}.effort_measured"]
             i = joints[name]
             white[i] = channel.noise**2 / max(channel.rate_hz, 1e-6)
@@ -587,29 +593,11 @@ class WindowModel(WindowedResidual):
         effort leave unknown, which is drawn as a line between its samples."""
         found = {}
         period = np.gradient(recording.time[episode.rows])
-        for joint in self._by_measured(recording):
+        for joint in by_measured(self.scene, recording):
             channel = recording.channels[f"{joint}.effort_measured"]
             y = recording[channel.name][episode.rows]
             found[joint] = jump_variance(y, channel.noise) * period**2
         return found
-
-    def _by_measured(self, recording: Recording) -> list[str]:
-        """Joints of which a measured effort stands in for the command."""
-        if self._commanded(recording):
-            return []
-        driven = self._driven("effort_command")
-        return [joint for joint in driven if f"{joint}.effort_measured" in recording]
-
-    def _commanded(self, recording: Recording) -> list[str]:
-        """Names of the commands that the scene's drives take."""
-        return [
-            c.name for c in recording.commands()
-            if c.name.rsplit(".", 1)[0] in self._driven(c.quantity)
-        ]  # fmt: skip
-
-    def _driven(self, quantity: str) -> list[str]:
-        act = self.scene.actuation
-        return act.joints if quantity in COMMANDS_OF[act.type] else []
 
     def places_of(self, kind: str) -> list[str]:
         """Where a kind may act."""
@@ -779,6 +767,27 @@ class WindowModel(WindowedResidual):
             e = (seen_in(self, w) - y) / size if len(y) else y
             out.append(np.where(np.isnan(e), 0.0, e))
         return out
+
+
+def by_measured(scene: Scene, recording: Recording) -> list[str]:
+    """Joints of which a measured effort stands in for the command."""
+    if commanded(scene, recording):
+        return []
+    driven = _driven(scene, "effort_command")
+    return [joint for joint in driven if f"{joint}.effort_measured" in recording]
+
+
+def commanded(scene: Scene, recording: Recording) -> list[str]:
+    """Names of the commands that the scene's drives take."""
+    return [
+        c.name for c in recording.commands()
+        if c.name.rsplit(".", 1)[0] in _driven(scene, c.quantity)
+    ]  # fmt: skip
+
+
+def _driven(scene: Scene, quantity: str) -> list[str]:
+    act = scene.actuation
+    return act.joints if quantity in COMMANDS_OF[act.type] else []
 
 
 def _velocity_starts(plant: MultibodyPlant) -> dict[str, int]:
