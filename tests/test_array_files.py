@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
+from makebreak.gap.data import arrays
 from makebreak.gap.data.recording_files import recording_files
 from makebreak.gap.data.table import read_table
 
@@ -96,6 +97,18 @@ def test_an_hdf5_file_is_arrays_attributes_and_tables(tmp_path, h5py):
     assert (
         len(columns) == 5 and "observations/image" in dict(table.notes)["not_columns"]
     )
+
+
+def test_an_hdf5_file_with_too_much_in_its_columns_is_refused(
+    tmp_path, monkeypatch, h5py
+):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["log/q"], file["image"] = Q, np.zeros((N, 9, 9, 9))
+    monkeypatch.setattr(arrays, "MOST_BYTES", Q.nbytes)
+    assert len(read_table(tmp_path / "a.h5").columns) == 3
+    monkeypatch.setattr(arrays, "MOST_BYTES", Q.nbytes - 1)
+    with pytest.raises(ValueError, match="cut it into several"):
+        read_table(tmp_path / "a.h5")
 
 
 def test_a_mat_file_of_version_7_3_is_read_as_the_older_ones(tmp_path, h5py):

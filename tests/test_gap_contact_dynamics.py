@@ -837,7 +837,7 @@ def test_windows_expect_what_the_noise_of_measured_efforts_makes(monkeypatch):
             episode = SimpleNamespace(first=0, rows=slice(0, 30))
             self.recordings = [Recorded(time, {channel.name: (channel, y)}, [episode])]
             given = Commands(time, {"a.effort_command": y})
-            self._commands = {(0, 0.0): [{0: given}]}
+            self._commands = {(0.0,): [{0: given}]}
             self._draw, self._led, self._pairs, self.windows = None, [], (), []
             self._creep = 0.0
             self.channels = ["a.position", "a.velocity"]

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from makebreak.gap import workflow
 from makebreak.gap.data.reading import read_recordings
 from makebreak.gap.data.robot import propose_scene, read_log, read_robot
 from makebreak.gap.problem import rms
@@ -119,6 +120,16 @@ def test_windows_know_the_noise_of_measured_efforts(tmp_path):
     assert 0.4 < rms(problem.base()) < 1.3
     assert problem.does_with([])
     assert not problem.does_with([Effect("link_mass", ["wiper.fore"], {"mass": 0.5})])
+
+
+def test_what_equations_of_measured_efforts_explain_is_not_asked_of_mujoco(
+    tmp_path, monkeypatch
+):
+    asked = []
+    monkeypatch.setattr(workflow, "_in_mujoco", lambda *args: asked.append(args))
+    main(["gap", *wiped(tmp_path, 8.0), "--out", str(tmp_path / "out")])
+    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert result["verdict"] == "no_gap" and not asked
 
 
 @pytest.mark.slow

@@ -48,8 +48,8 @@ def read_tree(path: Path, unused: frozenset[str], most_bytes: int) -> dict:
 
 def _tables(h5py, group) -> Iterator:
     """The data sets below a group that may be columns."""
-    for name, each in group.items():
-        if isinstance(each, h5py.Group) and not name.startswith("#"):
+    for each in group.values():
+        if isinstance(each, h5py.Group):
             yield from _tables(h5py, each)
         elif isinstance(each, h5py.Dataset) and each.ndim <= 2:
             yield each

@@ -271,12 +271,13 @@ class MujocoProblem(WindowModel, WindowedProblem):
         where these stand in for commands."""
         made = [np.zeros_like(y) for y in plain]
         if any(by_measured(self.scene, r) for r in self.recordings):
-            for self.effort_draw in range(1, DRAWN + 1):
+            self._draw = np.random.default_rng(0)
+            for _ in range(DRAWN):
                 for total, a, b in zip(
                     made, self.simulate(effects), plain, strict=True
                 ):
                     total += np.nan_to_num(a - b, posinf=0.0, neginf=0.0) ** 2 / DRAWN
-            self.effort_draw = 0
+            self._draw = None
         return made
 
     def does_with(self, effects: Sequence[Effect]) -> bool:
@@ -284,11 +285,12 @@ class MujocoProblem(WindowModel, WindowedProblem):
         them."""
         try:
             self._weigh(effects)
-            return rms(self.residual(effects)) <= AGREEMENT_RMS_MAX
+            if rms(self.residual(effects)) <= AGREEMENT_RMS_MAX:
+                return True
         except ValueError:
-            return False
-        finally:
-            self._weigh(())
+            pass
+        self._weigh(())
+        return False
 
     def residual(self, effects: Sequence[Effect] = ()) -> np.ndarray:
         """(m,) over the covariance of each window."""

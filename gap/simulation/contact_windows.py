@@ -17,8 +17,6 @@ import numpy as np
 from makebreak.gap.data.recording import Episode, Recording
 from makebreak.gap.does_not_fit import DoesNotFit
 from makebreak.gap.numerics.runs import runs_of
-from makebreak.gap.numerics.signal_noise import jump_variance
-from makebreak.gap.simulation.commands import Commands
 from makebreak.gap.simulation.contact_shapes import (
     APPROACH,
     MEETS,
@@ -33,7 +31,6 @@ from makebreak.gap.simulation.windows import (
     TURN,
     Window,
     WindowModel,
-    by_measured,
     drawn,
 )
 from makebreak.models.dynamics import SceneDynamics
@@ -125,30 +122,6 @@ class PushWindows(WindowModel):
                 columns[f"{joint}.position_command"] = now
                 columns[f"{joint}.velocity_command"] = np.interp(time, rows, v)
         return time, columns
-
-    def commands(self, effects: Sequence[Effect]) -> list[dict[int, Commands]]:
-        plain = super().commands(effects)
-        if self._draw is None or self._led:
-            return plain
-        return [
-            {e.first: self._other(r, e, given[e.first], self._draw) for e in r.episodes}
-            for r, given in zip(self.recordings, plain, strict=True)
-        ]
-
-    def _other(self, recording: Recording, episode: Episode, given: Commands, rng):
-        """Other efforts that their measurements allow, where these stand in for
-        commands: where a tip may stick or slip, no slope tells what noise does."""
-        rows = recording.time[episode.rows]
-        now = np.searchsorted(rows, given.time, "right") - 1
-        columns = dict(given.columns)
-        for joint in by_measured(self.scene, recording):
-            channel = recording.channels[f"{joint}.effort_measured"]
-            jumps = jump_variance(recording[channel.name][episode.rows], channel.noise)
-            off = np.sqrt(channel.noise**2 + jumps) * rng.normal(size=len(rows))
-            columns[f"{joint}.effort_command"] = (
-                columns[f"{joint}.effort_command"] + off[now]
-            )
-        return Commands(given.time, columns)
 
     def _cut(self, i, recording: Recording, episode: Episode, hop, block, number):
         if self._only is not None and (i, episode.number) not in self._only:

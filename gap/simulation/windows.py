@@ -188,7 +188,7 @@ class WindowModel(WindowedResidual):
     """
 
     commands_late = 0.0
-    effort_draw = 0  # Which errors are drawn of measured efforts; 0: none.
+    _draw: np.random.Generator | None = None  # Of errors of measured efforts.
     rows_sec = 0.0  # Rows closer than this are left out.
 
     def __init__(
@@ -452,11 +452,17 @@ class WindowModel(WindowedResidual):
             joint: given_late(effects, f"{joint}.effort_measured")
             for joint in _driven(self.scene, "effort_command")
         }
-        key = (
-            self.effort_draw, *late.values(), *(e.key for e in effects if self._untold)
-        )  # fmt: skip
-        if key in self._commands:
+        key = (*late.values(), *(e.key for e in effects if self._untold))
+        if key not in self._commands:
+            self._commands[key] = self._commands_with(effects, late)
+        if self._draw is None:
             return self._commands[key]
+        return [
+            {e.first: self._other(r, e, given[e.first], self._draw) for e in r.episodes}
+            for r, given in zip(self.recordings, self._commands[key], strict=True)
+        ]
+
+    def _commands_with(self, effects, late) -> list[dict[int, Commands]]:
         dynamics = None
         if self._untold:
             dynamics = SceneDynamics(replace(self.scene, effects=list(effects)))
@@ -476,8 +482,22 @@ class WindowModel(WindowedResidual):
                     columns |= self._untold_efforts(dynamics, path, time)
                 of[episode.first] = Commands(time, columns)
             out.append(of)
-        self._commands[key] = out
         return out
+
+    def _other(self, recording: Recording, episode: Episode, given: Commands, rng):
+        """Other efforts that their measurements allow, where these stand in for
+        commands: where a tip may stick or slip, no slope tells what noise does."""
+        rows = recording.time[episode.rows]
+        now = np.searchsorted(rows, given.time, "right") - 1
+        columns = dict(given.columns)
+        for joint in by_measured(self.scene, recording):
+            channel = recording.channels[f"{joint}.effort_measured"]
+            jumps = jump_variance(recording[channel.name][episode.rows], channel.noise)
+            off = np.sqrt(channel.noise**2 + jumps) * rng.normal(size=len(rows))
+            columns[f"{joint}.effort_command"] = (
+                columns[f"{joint}.effort_command"] + off[now]
+            )
+        return Commands(given.time, columns)
 
     def _given(self, recording: Recording, episode: Episode, i: int, late):
         """times and columns of commands that give what the motors gave: measured
@@ -491,14 +511,11 @@ class WindowModel(WindowedResidual):
         )
         middle = time + 0.5 * np.diff(time, append=time[-1])
         columns = {}
-        rng = np.random.default_rng((self.effort_draw, i, episode.first))
         for joint in _driven(self.scene, "effort_command"):
             key = f"{joint}.effort_measured"
             if key not in recording:
                 continue
             y = recording[key][episode.rows]
-            if self.effort_draw:
-                y = y + recording.channels[key].noise * rng.normal(size=len(y))
             good = np.isfinite(y)
             stages = recording.channels[key].stages or ()
             shown = middle + mean_delay(stages) + late[joint]
